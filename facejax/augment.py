@@ -1,0 +1,207 @@
+"""Peak-to-peak transitions made of performed neutral-to-peak motions, and their selection.
+
+A recorded sequence goes neutral -> peak -> neutral; a generator of transitions between any two expressions
+also needs peak -> peak. Otberdout et al. 2023, section 4.1: walk along the geodesic between the SRVFs of two
+neutral-to-peak motions; every point on it is a motion, and their last frames, in order, are a transition from
+the first peak to the second. Of the hundreds of thousands of pairs, those nearest to the mean peaks of their
+two expressions ("prototypes") are kept.
+
+`halves`, `transition` and `transitions` are array functions. `prototypes` and `select` choose data once, on
+the host, in NumPy: the number of rows they return depends on the labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from facejax.geometry import align, sphere
+
+
+class Motions(NamedTuple):
+    """K motions as `facejax.geometry.srvf.encode` gives them, with their first frames."""
+
+    q: jax.Array  # (K, T-1, L, 3), on the unit sphere
+    log_length: jax.Array  # (K,)
+    start: jax.Array  # (K, L, 3)
+
+
+class Selection(NamedTuple):
+    """P pairs of motions: transition k goes from the peak of pairs[k, 0] to the peak of pairs[k, 1]."""
+
+    pairs: np.ndarray  # (P, 2) int32, ordered by class of start, class of end, distance
+    distance: np.ndarray  # (P,) float64, of (start, end) to the two prototypes, in the unit of the landmarks
+
+
+@jax.jit
+def apex(curve: jax.Array) -> jax.Array:
+    """The frame (...) of a curve (..., T, L, 3) that is farthest, over all landmarks, from its first one."""
+    _check_curve(curve)
+    away = jnp.sum((curve - curve[..., :1, :, :]) ** 2, axis=(-2, -1))
+    return jnp.argmax(away, axis=-1)
+
+
+@jax.jit(static_argnames=("frames",))
+def halves(curve: jax.Array, peak: jax.Array | int, *, frames: int = 30) -> tuple[jax.Array, jax.Array]:
+    """Cut a curve (..., T, L, 3) at the frame `peak` (...) into onset and offset, each (..., frames, L, 3).
+
+    Both hold the peak; time is resampled evenly within each half.
+    """
+    _check_curve(curve)
+    if frames < 2:
+        raise ValueError(f"frames: expected at least 2, got {frames}")
+    tau = jnp.linspace(0, 1, frames, dtype=curve.dtype)
+    peak = jnp.asarray(peak, curve.dtype)[..., None]
+    rest = curve.shape[-3] - 1 - peak
+    return align.interpolate(curve, tau * peak), align.interpolate(curve, peak + tau * rest)
+
+
+@jax.jit(static_argnames=("frames",))
+def transition(
+    q1: jax.Array,
+    log_length1: jax.Array,
+    q2: jax.Array,
+    log_length2: jax.Array,
+    start1: jax.Array,
+    start2: jax.Array,
+    *,
+    frames: int = 30,
+) -> jax.Array:
+    """Landmarks (..., frames, L, 3) that go from the last frame of motion 1 to the last frame of motion 2.
+
+    q1, q2 are (..., T-1, L, 3) on the unit sphere, log lengths (...), starts (..., L, 3). Frame tau in [0, 1]
+    is the last frame of the motion at the fraction tau of the geodesic (eq. 10), its log-length and start
+    interpolated linearly.
+    """
+    # The last frame of a decoded motion is start + length / (T-1) * sum_t q_t |q_t|: the frames between are
+    # not needed. On the geodesic q = a p + b w, with p = q1, w = log(q1, q2), a = cos(tau theta) and
+    # b = sin(tau theta) / theta, |q_t|^2 = a^2 |p_t|^2 + 2ab <p_t, w_t> + b^2 |w_t|^2: three numbers per step
+    # serve all values of tau, and the sum over t is one product of (frames, 2(T-1)) by (2(T-1), 3L).
+    # Decoding each point of the geodesic in full takes 1,000 us a pair, this 70 (2 cores, chunks of 128).
+    if frames < 2:
+        raise ValueError(f"frames: expected at least 2, got {frames}")
+    for name, start in (("start1", start1), ("start2", start2)):
+        if jnp.shape(start)[-2:] != q1.shape[-2:]:
+            raise ValueError(f"{name}: expected (..., {q1.shape[-2]}, 3), got shape {jnp.shape(start)}")
+    w = sphere.log(q1, q2)
+    theta = sphere.norm(w)
+    tau = jnp.linspace(0, 1, frames, dtype=w.dtype)
+    angle = theta[..., None] * tau
+    a, b = jnp.cos(angle)[..., None], (tau * jnp.sinc(angle / jnp.pi))[..., None]
+    pp, pw, ww = (jnp.sum(x * y, axis=(-2, -1))[..., None, :] for x, y in ((q1, q1), (q1, w), (w, w)))
+    # Rounding may leave the square of a step that cancels just below 0; the root takes it as 0.
+    pace = sphere.root(a**2 * pp + 2 * a * b * pw + b**2 * ww)
+    weights = jnp.concatenate([a * pace, b * pace], axis=-1)
+    basis = jnp.concatenate(jnp.broadcast_arrays(q1, w), axis=-3)
+    moves = jnp.einsum("...ft,...tlc->...flc", weights, basis)
+    log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])
+    start = _between(tau[:, None, None], start1[..., None, :, :], start2[..., None, :, :])
+    return start + (jnp.exp(log_length) / q1.shape[-3])[..., None, None] * moves
+
+
+def transitions(
+    motions: Motions, pairs: np.ndarray, *, frames: int = 30, chunk: int = 128
+) -> Iterator[jax.Array]:
+    """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
+
+    Memory does not grow with P. The last chunk is padded inside, so that all share one compilation. Raises
+    `ValueError` on a malformed or out-of-range pair, before anything is computed.
+    """
+    pairs = np.asarray(pairs)
+    count = len(motions.q)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.issubdtype(pairs.dtype, np.integer):
+        raise ValueError(f"pairs: expected integers (P, 2), got {pairs.dtype} {pairs.shape}")
+    if chunk < 1:
+        raise ValueError(f"chunk: expected at least 1, got {chunk}")
+    if pairs.size and not (pairs.min() >= 0 and pairs.max() < count):
+        raise ValueError(f"pairs: expected indices in [0, {count}), got {pairs.min()} to {pairs.max()}")
+    return _stream(motions, pairs, frames, min(chunk, max(len(pairs), 1)))
+
+
+def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.ndarray:
+    """The mean peak (classes, L, 3) of each class, from peaks (K, L, 3) and labels (K,) in [0, classes).
+
+    Raises `ValueError` where a class has no peak: it has no mean.
+    """
+    peaks, labels = _labelled(peaks, labels, classes)
+    counts = np.bincount(labels, minlength=classes)
+    if not counts.all():
+        raise ValueError(
+            f"labels: expected every class at least once, got none of {np.flatnonzero(counts == 0)}"
+        )
+    sums = np.zeros((classes, *peaks.shape[1:]))
+    np.add.at(sums, labels, peaks)
+    return sums / counts[:, None, None]
+
+
+def select(peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per_pair: int) -> Selection:
+    """For each ordered pair of different classes, the `per_pair` transitions nearest to the two prototypes.
+
+    peaks are (K, L, 3), labels (K,), prototypes (classes, L, 3). The distance of a transition is the L2 norm
+    of (start, end) - (prototype of start, prototype of end). Pairs with fewer transitions give all they have;
+    a class may be absent. Ties go to the lower indices.
+    """
+    # A transition starts and ends at the two peaks themselves, so its squared distance is the sum of theirs.
+    # With both classes sorted, the transition of ranks (r, s) has (r+1)(s+1) - 1 others that are at least as
+    # near: the k nearest are among the O(k log k) with (r+1)(s+1) <= k, and the full product is never formed.
+    prototypes = np.asarray(prototypes, np.float64)
+    peaks, labels = _labelled(peaks, labels, len(prototypes))
+    if per_pair < 1:
+        raise ValueError(f"per_pair: expected at least 1, got {per_pair}")
+    if prototypes.shape[1:] != peaks.shape[1:]:
+        raise ValueError(f"prototypes: expected (classes, *{peaks.shape[1:]}), got {prototypes.shape}")
+    squared = np.sum((peaks - prototypes[labels]) ** 2, axis=(1, 2))
+    members = [np.flatnonzero(labels == label) for label in range(len(prototypes))]
+    members = [rows[np.argsort(squared[rows], kind="stable")] for rows in members]
+    pairs, distances = [np.zeros((0, 2), np.int32)], [np.zeros(0)]
+    for a, b in ((a, b) for a in range(len(members)) for b in range(len(members)) if a != b):
+        ranks = [
+            np.arange(min(per_pair // (r + 1), len(members[b])))
+            for r in range(min(per_pair, len(members[a])))
+        ]
+        first = members[a][np.repeat(np.arange(len(ranks)), [len(row) for row in ranks])]
+        second = members[b][np.concatenate(ranks)] if ranks else first
+        total = squared[first] + squared[second]
+        nearest = np.lexsort((second, first, total))[:per_pair]
+        pairs.append(np.stack([first[nearest], second[nearest]], axis=1).astype(np.int32))
+        distances.append(np.sqrt(total[nearest]))
+    return Selection(np.concatenate(pairs), np.concatenate(distances))
+
+
+def _between(tau: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
+    return a + tau * (b - a)
+
+
+@jax.jit(static_argnames=("frames",))
+def _chunk(motions: Motions, pairs: jax.Array, *, frames: int) -> jax.Array:
+    first, second = (jax.tree.map(lambda x, rows=rows: x[rows], motions) for rows in pairs.T)
+    return transition(
+        first.q, first.log_length, second.q, second.log_length, first.start, second.start, frames=frames
+    )
+
+
+def _stream(motions: Motions, pairs: np.ndarray, frames: int, chunk: int) -> Iterator[jax.Array]:
+    for begin in range(0, len(pairs), chunk):
+        rows = pairs[begin : begin + chunk]
+        padded = np.pad(rows, ((0, chunk - len(rows)), (0, 0)))
+        yield _chunk(motions, jnp.asarray(padded, jnp.int32), frames=frames)[: len(rows)]
+
+
+def _check_curve(curve: jax.Array) -> None:
+    if jnp.ndim(curve) < 3 or curve.shape[-1] != 3 or curve.shape[-3] < 2:
+        raise ValueError(f"expected a curve (..., T, L, 3) with T >= 2, got shape {jnp.shape(curve)}")
+
+
+def _labelled(peaks: np.ndarray, labels: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarray]:
+    peaks, labels = np.asarray(peaks, np.float64), np.asarray(labels)
+    if peaks.ndim != 3 or peaks.shape[-1] != 3:
+        raise ValueError(f"peaks: expected (K, L, 3), got {peaks.shape}")
+    if labels.shape != peaks.shape[:1] or not np.issubdtype(labels.dtype, np.integer):
+        raise ValueError(f"labels: expected integers ({len(peaks)},), got {labels.dtype} {labels.shape}")
+    if labels.size and not (labels.min() >= 0 and labels.max() < classes):
+        raise ValueError(f"labels: expected [0, {classes}), got {labels.min()} to {labels.max()}")
+    return peaks, labels

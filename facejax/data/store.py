@@ -1,0 +1,97 @@
+"""A 4D dataset on disk: an index and memory-mapped arrays, never held whole.
+
+    index.json      schema, name, version, labels, rate, subjects, sequences, hashes of what the arrays were made from
+    faces.npy       (F, 3) int32        the shared triangles
+    neutral.npy     (S, N, 3) float32   each subject at rest
+    landmarks.npy   (R, L, 3) float32   every frame of every sequence, one after the other
+    vertices.npy    (G, N, 3) float32   meshes of the frames that were drawn
+    drawn.npy       (G,) int64          their rows in landmarks.npy
+    landmark_index.npy (L,) int32       landmarks as vertices
+
+Millimetres, y up, z forward.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SCHEMA = 1
+SPLITS = ("train", "validation", "test")
+
+
+class StoreError(ValueError):
+    """A store is missing, incomplete or of another schema."""
+
+
+class Sequence(NamedTuple):
+    """One recording: rows `start` to `start + frames` of the landmarks."""
+
+    subject: int
+    label: str  # "high_smile", or "high_smile>mouth_open" for a direct transition
+    start: int
+    frames: int
+    onset: int  # frame numbers within the sequence
+    apex_start: int
+    apex_end: int
+    offset: int
+    duration: float  # seconds
+
+
+class Store(NamedTuple):
+    """An open dataset; the arrays are memory maps."""
+
+    path: Path
+    index: dict[str, Any]
+    sequences: tuple[Sequence, ...]
+    faces: np.ndarray
+    neutral: np.ndarray
+    landmarks: np.ndarray
+    vertices: np.ndarray
+    drawn: np.ndarray
+    landmark_index: np.ndarray
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The expression names, neutral first."""
+        return tuple(self.index["labels"])
+
+    def subjects(self, split: str) -> np.ndarray:
+        """Indices of a split's subjects. Raises `StoreError` for an unknown split."""
+        if split not in SPLITS:
+            raise StoreError(f"unknown split {split!r}, expected one of {', '.join(SPLITS)}")
+        return np.array([i for i, s in enumerate(self.index["subjects"]) if s["split"] == split], np.int64)
+
+    def row_subjects(self) -> np.ndarray:
+        """The subject of each landmark row, (R,)."""
+        return np.repeat([s.subject for s in self.sequences], [s.frames for s in self.sequences])
+
+    def meshes(self, split: str) -> tuple[np.ndarray, np.ndarray]:
+        """Positions in `vertices` that belong to a split, and the subject of each."""
+        owner = self.row_subjects()[self.drawn]
+        at = np.flatnonzero(np.isin(owner, self.subjects(split)))
+        return at, owner[at]
+
+
+def open_store(path: Path) -> Store:
+    """Open a dataset for reading. Raises `StoreError`, naming the file."""
+    path = Path(path)
+    try:
+        index = json.loads((path / "index.json").read_text())
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path / 'index.json'} cannot be read ({error}): is this a prepared dataset?") from error
+    if index.get("schema") != SCHEMA:
+        raise StoreError(f"{path}: schema {index.get('schema')}, expected {SCHEMA}: prepare the dataset anew")
+    arrays = {}
+    for name in ("faces", "neutral", "landmarks", "vertices", "drawn", "landmark_index"):
+        try:
+            arrays[name] = np.load(path / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{path / name}.npy cannot be read ({error}): prepare the dataset anew") from error
+        expected = index["shapes"][name]
+        if list(arrays[name].shape) != expected:
+            raise StoreError(f"{path / name}.npy has shape {arrays[name].shape}, expected {tuple(expected)}")
+    return Store(path, index, tuple(Sequence(**s) for s in index["sequences"]), **arrays)

@@ -1,0 +1,180 @@
+"""Alignment of landmarks in space and time: centring, Procrustes, the unitless scale, resampling.
+
+Landmarks are (..., L, 3), curves of them (..., T, L, 3), in any unit. Leading axes are free and broadcast.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from facejax.geometry.sphere import root
+
+
+class Similarity(NamedTuple):
+    """x -> scale * rotation @ x + translation."""
+
+    rotation: jax.Array  # (..., 3, 3), orthonormal, determinant +1
+    scale: jax.Array  # (...), positive; 1 in a rigid motion
+    translation: jax.Array  # (..., 3)
+
+
+@jax.jit
+def centre(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Points (..., K, 3) -> the points about their centroid (..., K, 3), and the centroid (..., 3)."""
+    _check_points(points, "points")
+    centroid = jnp.mean(points, axis=-2)
+    return points - centroid[..., None, :], centroid
+
+
+@jax.jit
+def normalise(landmarks: jax.Array, neutral: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Curve (..., T, L, 3), neutral landmarks (..., L, 3) of its subject -> unitless curve, scale, centroid.
+
+    The curve minus the centroid (..., 3) of the *neutral* landmarks, divided by their centred Frobenius norm,
+    the scale (...). One centroid and one scale hold for all frames and all sequences of a subject: those of
+    each frame would let an open jaw shrink the head. Neutral landmarks that are one single point have scale
+    1.
+    """
+    _check_curve(landmarks, 1)
+    _check_points(neutral, "neutral", landmarks.shape[-2])
+    centred, centroid = centre(neutral)
+    squared = jnp.sum(centred**2, axis=(-2, -1))
+    scale = jnp.sqrt(jnp.where(squared > 0, squared, 1))
+    return (landmarks - centroid[..., None, None, :]) / scale[..., None, None, None], scale, centroid
+
+
+@jax.jit
+def denormalise(unitless: jax.Array, scale: jax.Array, centroid: jax.Array) -> jax.Array:
+    """The inverse of `normalise`: unitless (..., T, L, 3), scale (...), centroid (..., 3) -> the curve."""
+    _check_curve(unitless, 1)
+    return unitless * jnp.asarray(scale)[..., None, None, None] + jnp.asarray(centroid)[..., None, None, :]
+
+
+@jax.jit(static_argnames=("scaling",))
+def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -> Similarity:
+    """The rotation, translation and, with `scaling`, scale that bring source (..., K, 3) nearest to target.
+
+    Least squares over the K points, never a reflection (Kabsch 1976; scale after Umeyama 1991). Gradients are
+    exact, with equal singular values too; where the best rotation is not unique (points on one line, or a
+    mirror image with a symmetry) one of them is returned, with gradient 0.
+    """
+    _check_points(source, "source")
+    _check_points(target, "target", source.shape[-2])
+    from_, source_centroid = centre(source)
+    to, target_centroid = centre(target)
+    covariance = jnp.einsum("...ki,...kj->...ij", to, from_)
+    rotation = _rotation(covariance)
+    spread = jnp.sum(from_**2, axis=(-2, -1)) + jnp.zeros(covariance.shape[:-2], covariance.dtype)
+    overlap = jnp.sum(rotation * covariance, axis=(-2, -1))
+    usable = spread > 0
+    scale = jnp.where(usable, overlap / jnp.where(usable, spread, 1), 1) if scaling else jnp.ones_like(spread)
+    turned = jnp.einsum("...ij,...j->...i", rotation, source_centroid)
+    return Similarity(rotation, scale, target_centroid - scale[..., None] * turned)
+
+
+@jax.jit
+def apply(similarity: Similarity, points: jax.Array) -> jax.Array:
+    """The points (..., K, 3) moved by a similarity."""
+    _check_points(points, "points")
+    turned = jnp.einsum("...ij,...kj->...ki", similarity.rotation, points)
+    return similarity.scale[..., None, None] * turned + similarity.translation[..., None, :]
+
+
+@jax.jit(static_argnames=("frames", "by"))
+def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
+    """The curve (..., T, L, 3) read at `frames` places, linearly interpolated: (..., frames, L, 3).
+
+    by="time": evenly spaced in time, which keeps the timing of onset and apex. by="arc": evenly spaced along
+    the curve, which makes the speed constant. First and last frame are kept exactly; a curve that stands
+    still stays as it is. Where a place falls on a frame, the gradient of "arc" is that of one of the two
+    neighbouring segments.
+    """
+    _check_curve(curve, 2)
+    if frames < 2:
+        raise ValueError(f"frames: expected at least 2, got {frames}")
+    if by == "time":
+        places = np.linspace(0, curve.shape[-3] - 1, frames)
+        index = np.floor(places).astype(np.int32)
+        return _read(curve, jnp.asarray(index), jnp.asarray(places - index, curve.dtype))
+    if by != "arc":
+        raise ValueError(f'by: expected "time" or "arc", got {by!r}')
+    steps = root(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1)))
+    covered = jnp.concatenate([jnp.zeros_like(steps[..., :1]), jnp.cumsum(steps, axis=-1)], axis=-1)
+    wanted = covered[..., -1:] * jnp.linspace(0, 1, frames, dtype=curve.dtype)
+    # The last frame that is not beyond the place: the segment after it has a length, except at the very end.
+    index = jnp.sum(covered[..., None, :] <= wanted[..., :, None], axis=-1) - 1
+    before = jnp.take_along_axis(covered, index, axis=-1)
+    after = jnp.take_along_axis(covered, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-1)
+    inside = after > before
+    return _read(curve, index, jnp.where(inside, (wanted - before) / jnp.where(inside, after - before, 1), 0))
+
+
+@jax.jit
+def interpolate(curve: jax.Array, places: jax.Array) -> jax.Array:
+    """The curve (..., T, L, 3) read at places (..., F), in frames and clipped to [0, T-1]: (..., F, L, 3)."""
+    _check_curve(curve, 1)
+    places = jnp.clip(jnp.asarray(places, curve.dtype), 0, curve.shape[-3] - 1)
+    index = jnp.floor(places)
+    return _read(curve, index.astype(jnp.int32), places - index)
+
+
+def _read(curve: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
+    """curve[index] + weight * (curve[index + 1] - curve[index]) for index and weight (..., F)."""
+    lead = jnp.broadcast_shapes(curve.shape[:-3], index.shape[:-1])
+    curve = jnp.broadcast_to(curve, lead + curve.shape[-3:])
+    index, weight = (jnp.broadcast_to(x, lead + x.shape[-1:])[..., None, None] for x in (index, weight))
+    here = jnp.take_along_axis(curve, index, axis=-3)
+    there = jnp.take_along_axis(curve, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-3)
+    # This form, unlike (1 - w) a + w b, gives a back where a = b: standing still survives rounding.
+    return here + weight * (there - here)
+
+
+@jax.custom_jvp
+def _rotation(matrix: jax.Array) -> jax.Array:
+    """The rotation R (..., 3, 3) of greatest trace(R' M) for M (..., 3, 3)."""
+    u, _, vt = jnp.linalg.svd(matrix)
+    handed = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
+    flip = jnp.stack([jnp.ones_like(handed), jnp.ones_like(handed), handed], axis=-1)
+    return (u * flip[..., None, :]) @ vt
+
+
+@_rotation.defjvp
+def _rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    # M = R S with S symmetric. With dR = R [w]x, the skew part of R' dM = [w]x S + dS gives
+    # (trace(S) I - S) w = vee(R' dM - dM' R). Differentiating the SVD itself divides by differences of
+    # singular values and is NaN where two of them are equal; this divides by their sums.
+    (matrix,), (change,) = primals, tangents
+    rotation = _rotation(matrix)
+    stretch = jnp.einsum("...ki,...kj->...ij", rotation, matrix)
+    stretch = (stretch + jnp.swapaxes(stretch, -1, -2)) / 2
+    trace = jnp.trace(stretch, axis1=-2, axis2=-1)[..., None, None]
+    eye = jnp.eye(3, dtype=matrix.dtype)
+    system = trace * eye - stretch
+    unique = jnp.linalg.det(system)[..., None, None] > jnp.finfo(matrix.dtype).eps * trace**3
+    turned = jnp.einsum("...ki,...kj->...ij", rotation, change)
+    skew = turned - jnp.swapaxes(turned, -1, -2)
+    vector = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)[..., None]
+    x, y, z = jnp.moveaxis(jnp.linalg.solve(jnp.where(unique, system, eye), vector)[..., 0], -1, 0)
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(matrix.shape)
+    return rotation, jnp.where(unique, rotation @ cross, 0)
+
+
+def _check_points(points: jax.Array, name: str, count: int | None = None) -> None:
+    shape = jnp.shape(points)
+    if len(shape) < 2 or shape[-1] != 3 or (count is not None and shape[-2] != count):
+        wanted = "(..., K, 3)" if count is None else f"(..., {count}, 3)"
+        raise ValueError(f"{name}: expected {wanted}, got shape {shape}")
+    if not jnp.issubdtype(jnp.result_type(points), jnp.floating):
+        raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(points)}")
+
+
+def _check_curve(curve: jax.Array, least: int) -> None:
+    shape = jnp.shape(curve)
+    if len(shape) < 3 or shape[-3] < least:
+        raise ValueError(f"expected a curve (..., T, L, 3) with T >= {least}, got shape {shape}")
+    _check_points(curve, "curve")

@@ -1,0 +1,222 @@
+"""The unit sphere of motions: exponential, logarithm, distance, geodesics, transport and means.
+
+Glossary
+    T   frames of a motion; a point has T-1 steps.
+    L   landmarks.
+    p, q, r   points: arrays (..., T-1, L, 3) with inner(p, p) = 1, so their Frobenius norm is sqrt(T-1).
+    u, v, w   tangent vectors at a point, of the same shape: inner(p, v) = 0.
+
+The last three axes are fixed; leading axes are free and broadcast. The maps are equations 3, 4 and 10 of
+Otberdout et al. 2023 ("Generating Complex 4D Expression Transitions by Learning Face Landmark Trajectories");
+the angle is taken by atan2, which is accurate near 0 and near pi, where an arc cosine loses half the digits.
+
+Singular points. `exp` is smooth everywhere and `log` at the identity too; their series take over from a
+radius that depends on the dtype. `norm` and `distance` have a kink at 0, and `distance` one at the antipode:
+the gradient there is 0. At the antipode `log` has no limit; it returns pi times a fixed tangent direction,
+with gradient 0, and `geodesic` and `transport` follow the half circle along that direction. Nothing gives a
+NaN; a point that is zero, as a motion at standstill is, has logarithm and distance 0.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+_POINT = (-3, -2, -1)
+
+
+@jax.jit
+def root(squared: jax.Array) -> jax.Array:
+    """The square root of an array of any shape; 0, with derivative 0, where it is not positive."""
+    # The argument is made safe before the root is taken: a `where` after it alone would let a NaN flow back.
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+
+
+@jax.jit
+def inner(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Inner product (...) of a and b (..., T-1, L, 3): the sum over landmarks and axes, the mean over steps.
+
+    Raises `ValueError` on shapes that end differently, or on a dtype that is not floating.
+    """
+    _check(a, b)
+    return jnp.sum(a * b, axis=_POINT) / a.shape[-3]
+
+
+@jax.jit
+def norm(a: jax.Array) -> jax.Array:
+    """Norm (...) of a (..., T-1, L, 3); its gradient at 0 is 0."""
+    return root(inner(a, a))
+
+
+@jax.jit
+def project(p: jax.Array, v: jax.Array) -> jax.Array:
+    """The part (..., T-1, L, 3) of v that is tangent at the point p. p may have any length."""
+    # Dividing by <p, p> costs one product and makes the result independent of rounding in the length of p.
+    squared = inner(p, p)
+    along = inner(p, v) / jnp.where(squared > 0, squared, 1)
+    return v - _wide(along) * p
+
+
+@jax.jit
+def exp(p: jax.Array, v: jax.Array) -> jax.Array:
+    """The point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
+
+    It has unit norm where v is tangent at p: `project` first what may not be.
+    """
+    cosine, sinc = _cos_sinc(inner(v, v))
+    return _wide(cosine) * p + _wide(sinc) * v
+
+
+@jax.jit
+def log(p: jax.Array, q: jax.Array) -> jax.Array:
+    """The tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
+    u, squared, cosine = _split(p, q)
+    eps = jnp.finfo(squared.dtype).eps
+    near = (cosine > 0) & (squared < eps**0.25 * cosine**2)
+    far = ~near & (squared > eps**2)
+
+    # theta / |u| = atan2(|u|, cosine) / |u|; below the radius, where autodiff would cancel, its series.
+    safe_cosine = jnp.where(near, cosine, 1)
+    x = jnp.where(near, squared, 0) / safe_cosine**2
+    series = (1 + x * (-1 / 3 + x * (1 / 5 - x / 7))) / safe_cosine
+    sine = jnp.sqrt(jnp.where(far, squared, 1))
+    ratio = jnp.where(near, series, jnp.where(far, jnp.arctan2(sine, cosine) / sine, 0))
+
+    antipode = ~near & ~far & (cosine < 0)
+    return jnp.where(_wide(antipode), jnp.pi * _fixed_direction(p), _wide(ratio) * u)
+
+
+@jax.jit
+def distance(p: jax.Array, q: jax.Array) -> jax.Array:
+    """The angle (...) between p and q, in [0, pi]; its gradient is 0 at p = q and at p = -q."""
+    _, squared, cosine = _split(p, q)
+    empty = (squared == 0) & (cosine == 0)
+    return jnp.arctan2(root(squared), jnp.where(empty, 1, cosine))
+
+
+@jax.jit
+def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
+    """The point (..., T-1, L, 3) at the fraction tau (...) of the shortest arc from p (tau 0) to q (tau 1).
+
+    Equation 10 with its parentheses restored, (sin((1-tau) theta) p + sin(tau theta) q) / sin theta, written
+    as exp(p, tau log(p, q)): no quotient of sines at 0 and at pi. tau outside [0, 1] extrapolates along the
+    circle.
+    """
+    return exp(p, _wide(jnp.asarray(tau, jnp.result_type(p, q))) * log(p, q))
+
+
+@jax.jit
+def transport(p: jax.Array, q: jax.Array, v: jax.Array) -> jax.Array:
+    """Parallel transport (..., T-1, L, 3) of the tangent vector v from p to q along their geodesic."""
+    # On tangent vectors at p, transport is the reflection across the hyperplane normal to p + q. A reflection
+    # keeps lengths to the last digit, also near the antipode, where 1 + <p, q> would cancel.
+    _check(p, q, v)
+    middle = p + q
+    antipode = _wide(inner(middle, middle) <= jnp.finfo(middle.dtype).eps ** 2)
+    middle = jnp.where(antipode, _fixed_direction(p), middle)
+    return v - _wide(2 * inner(middle, v) / inner(middle, middle)) * middle
+
+
+@jax.jit
+def extrinsic_mean(qs: jax.Array) -> jax.Array:
+    """The average (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3), brought back to the sphere.
+
+    Where the average vanishes, as that of two antipodes does, the first point is returned.
+    """
+    _check_set(qs)
+    average = jnp.mean(qs, axis=-4)
+    length = norm(average)
+    usable = length > jnp.finfo(qs.dtype).eps
+    return jnp.where(_wide(usable), average / _wide(jnp.where(usable, length, 1)), qs[..., 0, :, :, :])
+
+
+@jax.jit(static_argnames=("steps",))
+def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = None) -> jax.Array:
+    """The point (..., T-1, L, 3) of least summed squared distance to qs (..., K, T-1, L, 3).
+
+    From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
+    `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole batch, or for
+    `steps` steps. The mean is unique when all points lie within pi/2 of one point. Gradients are exact in
+    both modes: they come from the stationarity condition, not from the iterations.
+    """
+    _check_set(qs)
+    if steps < 1:
+        raise ValueError(f"steps: expected at least 1, got {steps}")
+    tolerance = 16 * jnp.finfo(qs.dtype).eps if tolerance is None else tolerance
+
+    def pull(p: jax.Array) -> jax.Array:
+        return jnp.mean(log(p[..., None, :, :, :], qs), axis=-4)
+
+    def stationary(p: jax.Array) -> jax.Array:
+        # The second term holds p to the sphere and makes the Jacobian regular along p.
+        return _wide(inner(p, p) - 1) * p - pull(p)
+
+    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        step, _, v = carry
+        return (step < steps) & jnp.any(norm(v) > tolerance)
+
+    def move(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        step, p, v = carry
+        p = exp(p, v)
+        # Hundreds of steps would add up their rounding in the length of p.
+        p = p / _wide(norm(p))
+        return step + 1, p, pull(p)
+
+    def solve(_, start: jax.Array) -> jax.Array:
+        return lax.while_loop(unfinished, move, (0, start, pull(start)))[1]
+
+    def tangent_solve(jacobian, y: jax.Array) -> jax.Array:
+        # The Jacobian at the root is the Hessian of the objective plus 2 p p': symmetric, with K + 2 distinct
+        # eigenvalues at most, so that conjugate gradients end after as many steps.
+        return jax.scipy.sparse.linalg.cg(jacobian, y, tol=4 * jnp.finfo(y.dtype).eps, maxiter=100)[0]
+
+    return lax.custom_root(stationary, lax.stop_gradient(extrinsic_mean(qs)), solve, tangent_solve)
+
+
+def _check(*points: jax.Array) -> None:
+    shapes = [jnp.shape(point) for point in points]
+    if any(len(shape) < 3 for shape in shapes) or len({shape[-3:] for shape in shapes}) > 1:
+        raise ValueError(f"expected arrays (..., T-1, L, 3) that end alike, got shapes {shapes}")
+    for point in points:
+        if not jnp.issubdtype(jnp.result_type(point), jnp.floating):
+            raise ValueError(f"expected a floating dtype, got {jnp.result_type(point)}")
+
+
+def _check_set(qs: jax.Array) -> None:
+    if jnp.ndim(qs) < 4 or qs.shape[-4] == 0:
+        raise ValueError(f"expected at least one point, (..., K, T-1, L, 3), got shape {jnp.shape(qs)}")
+
+
+def _wide(scalars: jax.Array) -> jax.Array:
+    """One number per point (...) -> (..., 1, 1, 1)."""
+    return jnp.asarray(scalars)[..., None, None, None]
+
+
+def _cos_sinc(squared: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """cos x and sin x / x from x squared, of which both are smooth functions."""
+    near = squared < jnp.finfo(squared.dtype).eps ** 0.25
+    s = jnp.where(near, squared, 0)
+    x = jnp.sqrt(jnp.where(near, 1, squared))
+    cosine = 1 + s * (-1 / 2 + s * (1 / 24 + s * (-1 / 720 + s / 40320)))
+    sinc = 1 + s * (-1 / 6 + s * (1 / 120 + s * (-1 / 5040 + s / 362880)))
+    return jnp.where(near, cosine, jnp.cos(x)), jnp.where(near, sinc, jnp.sin(x) / x)
+
+
+def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The part u of q that is tangent at p, its squared norm, and the cosine <p, q>."""
+    cosine = inner(p, q)
+    # Near p (or -p) the difference q - p (or q + p) is free of rounding, and projecting it instead of q keeps
+    # small angles to full relative precision; in exact arithmetic the projection is the same.
+    u = project(p, q - _wide(jnp.where(cosine < 0, -1, 1)) * p)
+    return u, inner(u, u), cosine
+
+
+def _fixed_direction(p: jax.Array) -> jax.Array:
+    """A unit tangent vector at p: along the first coordinate, or the second where p leans on the first."""
+    first = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 0].set(1)
+    second = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 1].set(1)
+    leans = jnp.abs(p[..., 0, 0, 0]) > jnp.abs(p[..., 0, 0, 1])
+    direction = project(p, jnp.where(_wide(leans), second, first))
+    return lax.stop_gradient(direction / _wide(norm(direction)))

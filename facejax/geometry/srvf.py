@@ -1,0 +1,100 @@
+"""The square-root velocity transform: a landmark curve <-> a point on the sphere and the log of its length.
+
+A curve is (..., T, L, 3): T frames, evenly spaced in time over [0, 1], in any unit. Its steps are the T-1
+forward differences d, each taken as one vector of 3L numbers; its length is the sum of their norms. The point
+
+    q = v / sqrt|v|,   v = (T-1) d / length                                (Otberdout et al. 2023, eq. 1)
+
+then has exactly unit norm on `facejax.geometry.sphere`, whatever T is, and the inverse, a running sum, is
+exact. Unit length throws the amplitude away: `encode` returns it beside q, as the natural log of the length
+in the curve's own unit.
+
+Standing still. A curve shorter than 1e-12 has q = 0 and log_length = log 1e-12, and decodes to the constant
+curve. q grows as the square root of a step, so it has no derivative where a step is zero: the gradient of
+that step is 0 there, as is every gradient of a curve that stands still. Everywhere else gradients are exact.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from facejax.geometry.sphere import root
+
+FLOOR = 1e-12
+"""Length below which a curve stands still, in the curve's unit."""
+
+
+@jax.jit
+def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Curve (..., T, L, 3) -> q (..., T-1, L, 3) on the unit sphere, and log_length (...).
+
+    Nothing is centred or scaled here (see `facejax.geometry.align.normalise`). Raises `ValueError` on fewer
+    than two frames, on a last axis that is not 3, or on a dtype that is not floating.
+    """
+    _check(curve, "curve", "T", 2)
+    steps = jnp.diff(curve, axis=-3)
+    # q does not depend on the scale of the steps, and the length is proportional to it. So both may be
+    # computed on steps divided by their largest entry, held constant: values and gradients are the same, and
+    # no square leaves the range of float32, however small the unit.
+    largest = lax.stop_gradient(jnp.max(jnp.abs(steps), axis=(-3, -2, -1)))
+    scale = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
+    steps = steps / _wide(scale)
+    squared = jnp.sum(steps**2, axis=(-2, -1))
+    # Below this a step is less than the rounding of the largest, and the powers of its gradient would
+    # overflow.
+    moved = squared > jnp.finfo(squared.dtype).tiny ** 0.5
+    norms = root(jnp.where(moved, squared, 0))
+    relative = jnp.sum(norms, axis=-1)
+    moving = scale * relative > FLOOR
+    relative = jnp.where(moving, relative, 1)
+    kept = moved & moving[..., None]
+    factor = jnp.sqrt(steps.shape[-3] / (jnp.where(kept, norms, 1) * relative[..., None]))
+    q = jnp.where(kept, factor, 0)[..., None, None] * steps
+    return q, jnp.where(moving, jnp.log(scale) + jnp.log(relative), jnp.log(FLOOR))
+
+
+@jax.jit
+def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
+    """q (..., T-1, L, 3), log_length (...), start (..., L, 3) -> curve (..., T, L, 3) in the unit of start.
+
+    The inverse of `encode`. Each step is length q|q| / (T-1); the curve's length is exp(log_length) where q
+    is on the unit sphere, which is not checked.
+    """
+    _check(q, "q", "T-1", 1)
+    if jnp.shape(start)[-2:] != q.shape[-2:]:
+        raise ValueError(f"start: expected (..., L, 3) with L = {q.shape[-2]}, got shape {jnp.shape(start)}")
+    steps = displacement(q, log_length)
+    moved = jnp.concatenate([jnp.zeros_like(steps[..., :1, :, :]), jnp.cumsum(steps, axis=-3)], axis=-3)
+    return jnp.asarray(start)[..., None, :, :] + moved
+
+
+@jax.jit
+def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
+    """The steps (..., T-1, L, 3) between frames, exp(log_length) q|q| / (T-1), for q (..., T-1, L, 3)."""
+    _check(q, "q", "T-1", 1)
+    # q|q| is differentiable at 0, with derivative 0, and the safe root gives just that.
+    norms = root(jnp.sum(q**2, axis=(-2, -1)))
+    pace = jnp.exp(jnp.asarray(log_length))[..., None] * norms / q.shape[-3]
+    return pace[..., None, None] * q
+
+
+@jax.jit
+def length(curve: jax.Array) -> jax.Array:
+    """Length (...) of the curve (..., T, L, 3) in its own unit: the sum of the norms of its (L, 3) steps."""
+    _check(curve, "curve", "T", 2)
+    return jnp.sum(root(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1))), axis=-1)
+
+
+def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
+    shape = jnp.shape(array)
+    if len(shape) < 3 or shape[-1] != 3 or shape[-3] < least:
+        raise ValueError(f"{name}: expected (..., {axis}, L, 3) with {axis} >= {least}, got shape {shape}")
+    if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
+        raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
+
+
+def _wide(scalars: jax.Array) -> jax.Array:
+    """One number per curve (...) -> (..., 1, 1, 1)."""
+    return scalars[..., None, None, None]

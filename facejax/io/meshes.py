@@ -1,0 +1,227 @@
+"""Triangle meshes in PLY, OBJ, NPZ and NPY files.
+
+Vertex order is kept exactly; polygons are cut into fans; everything but positions and faces is ignored. A
+file is a claim to be checked: counts are held against the bytes that are there before memory is taken, and
+nothing is unpickled.
+"""
+
+import math
+import os
+import re
+import shutil
+import tempfile
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from facejax.io import files, ply
+
+LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
+_ARRAY_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+# What the readers, and the zip and array parsers below them, raise on damaged input.
+_DAMAGE = (
+    ValueError,
+    LookupError,
+    EOFError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+_FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
+
+
+class MeshError(ValueError):
+    """A mesh file cannot be used; the message names the file, what is wrong and where."""
+
+
+class Mesh(NamedTuple):
+    """vertices: (N, 3) float64, in the file's unit. faces: (F, 3) int32, or None."""
+
+    vertices: np.ndarray
+    faces: np.ndarray | None
+
+
+def read(path: str | os.PathLike) -> Mesh:
+    """Reads a mesh by the file's suffix: .ply, .obj, .npz (`vertices`, optional `faces`) or .npy (vertices).
+
+    Raises:
+      MeshError: the file is missing, unreadable, cut short, empty or not a mesh; a vertex is not finite; a
+      face names
+        a vertex that is not there.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise MeshError(f"{path}: unknown mesh format {path.suffix!r}; expected {', '.join(_READERS)}")
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise MeshError(f"{path}: not a file")
+        if not 0 < size <= LIMIT:
+            raise MeshError(f"{path}: {size} bytes; expected 1 to {LIMIT}")
+        vertices, faces = reader(path)
+    except MeshError:
+        raise
+    except FileNotFoundError:
+        raise MeshError(f"{path}: no such file") from None
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGE as error:
+        raise MeshError(f"{path}: {error}") from error
+    return _checked(path, vertices, faces)
+
+
+def write(path: str | os.PathLike, vertices, faces=None) -> None:
+    """Writes a mesh by suffix (.ply binary, .obj text, .npz), atomically; floats come back bit for bit.
+
+    Args:
+      vertices: (N, 3).
+      faces: (F, 3) int, or None.
+    """
+    path = Path(path)
+    writer = _WRITERS.get(path.suffix.lower())
+    if writer is None:
+        raise ValueError(f"{path}: unknown mesh format {path.suffix!r}; expected {', '.join(_WRITERS)}")
+    vertices = np.asarray(vertices)
+    vertices = vertices if vertices.dtype == np.float32 else vertices.astype(np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"{path}: vertices must be (N, 3), got {vertices.shape}")
+    faces = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ValueError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
+    with files.replacing(path) as temporary:
+        writer(temporary, vertices, faces.astype(np.int32))
+
+
+def write_sequence(folder: str | os.PathLike, vertices, faces, *, format="ply") -> None:
+    """Writes frames 000001.ply, 000002.ply, ... of vertices (T, N, 3) as a folder, which appears whole.
+
+    Frames of an earlier run are replaced.
+
+    Raises:
+      ValueError: the folder holds anything but frames.
+    """
+    folder = Path(folder)
+    if f".{format}" not in _WRITERS:
+        raise ValueError(f"unknown frame format {format!r}; expected ply, obj or npz")
+    if folder.exists():
+        other = [entry.name for entry in folder.iterdir() if not _FRAME.fullmatch(entry.name)]
+        if other:
+            raise ValueError(f"{folder}: holds {other[0]!r}, which is no frame; name an empty folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
+        fresh = Path(temporary) / "frames"
+        fresh.mkdir()
+        for t, frame in enumerate(np.asarray(vertices)):
+            write(fresh / f"{t + 1:06d}.{format}", frame, faces)
+        if folder.exists():
+            shutil.rmtree(folder)
+        os.replace(fresh, folder)
+
+
+def _read_obj(path: Path):
+    vertices, faces = [], []
+    text = path.read_text("utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), 1):
+        kind, *rest = line.split(maxsplit=1)[:2] or [""]
+        if kind not in ("v", "f") or not rest:
+            continue
+        fields = rest[0].split("#")[0].split()
+        try:
+            if kind == "v":
+                x, y, z = fields[:3]
+                vertices.append((float(x), float(y), float(z)))
+                continue
+            corner = [int(field.split("/")[0]) for field in fields]
+        except ValueError:
+            raise ValueError(f"line {number}: cannot be understood: {line[:60]!r}") from None
+        if len(corner) < 3 or 0 in corner:
+            raise ValueError(f"line {number}: expected 3 or more corners from 1 on: {line[:60]!r}")
+        # Negative numbers count back from the latest vertex.
+        corner = [i - 1 if i > 0 else len(vertices) + i for i in corner]
+        faces.extend((corner[0], corner[i], corner[i + 1]) for i in range(1, len(corner) - 1))
+    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+
+
+def _read_npz(path: Path):
+    with zipfile.ZipFile(path) as archive:
+        names = set(archive.namelist())
+        if "vertices.npy" not in names:
+            raise ValueError(f"holds no array 'vertices', only {sorted(name[:-4] for name in names)}")
+        arrays = []
+        for name in ("vertices.npy", "faces.npy"):
+            if name not in names:
+                arrays.append(None)
+                continue
+            with archive.open(name) as stream:
+                arrays.append(_read_array(stream, archive.getinfo(name).file_size, name[:-4]))
+    return arrays
+
+
+def _read_npy(path: Path):
+    with path.open("rb") as stream:
+        return _read_array(stream, path.stat().st_size, "array"), None
+
+
+def _read_array(stream, size: int, name: str) -> np.ndarray:
+    """One .npy stream of a known size, its header held against that size first."""
+    if size > LIMIT:
+        raise ValueError(f"{name}: {size} bytes, more than {LIMIT}")
+    version = np.lib.format.read_magic(stream)
+    if version not in _ARRAY_HEADERS:
+        raise ValueError(f"{name}: unknown array format {version}")
+    shape, fortran, dtype = _ARRAY_HEADERS[version](stream)
+    if dtype.hasobject or dtype.kind not in "fiu":
+        raise ValueError(f"{name}: must hold numbers, got {dtype}")
+    need, there = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if need != there:
+        raise ValueError(f"{name}: {shape} {dtype} needs {need} bytes, the file holds {there}")
+    return np.frombuffer(stream.read(need), dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _checked(path: Path, vertices, faces) -> Mesh:
+    vertices = np.array(vertices, np.float64)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MeshError(f"{path}: vertices must be (N, 3), got {vertices.shape}")
+    if not len(vertices):
+        raise MeshError(f"{path}: holds no vertices")
+    bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+    if len(bad):
+        raise MeshError(
+            f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)"
+        )
+    if faces is None or not len(faces):
+        return Mesh(vertices, None)
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise MeshError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
+    bad = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))
+    if len(bad):
+        raise MeshError(
+            f"{path}: triangle {bad[0]} is {faces[bad[0]].tolist()}; vertices are 0..{len(vertices) - 1}"
+        )
+    return Mesh(vertices, faces.astype(np.int32))
+
+
+def _write_obj(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    digits = 9 if vertices.dtype == np.float32 else 17
+    with path.open("w", encoding="ascii", newline="\n") as stream:
+        np.savetxt(stream, vertices, f"v %.{digits}g %.{digits}g %.{digits}g")
+        np.savetxt(stream, faces + 1, "f %d %d %d")
+
+
+def _write_npz(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    np.savez(path, vertices=vertices, faces=faces)
+
+
+_READERS = {".ply": ply.read, ".obj": _read_obj, ".npz": _read_npz, ".npy": _read_npy}
+_WRITERS = {".ply": ply.write, ".obj": _write_obj, ".npz": _write_npz}

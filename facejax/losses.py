@@ -1,0 +1,166 @@
+"""Losses of the two networks: Wasserstein with gradient penalty for motion, displacement L1 for meshes.
+
+Vocabulary: a *sample* is any pytree of arrays; a *condition* is what both players of the game are told about it
+(here: the two labels). `score(sample, condition)` judges ONE sample and returns a scalar. Mesh losses take
+displacements in millimetres with leading axes free; they sum over x, y, z, take the mean over the vertices and
+over the leading axes, so that a figure reads "millimetres (L1) per vertex".
+
+Functions that take arrays are jitted; those that take a `score` are left to the caller's jit.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Sample = Any
+Condition = Any
+Score = Callable[[Sample, Condition], jax.Array]
+
+
+def gradient_penalty(
+    score: Score, key: jax.Array, real: Sample, fake: Sample, condition: Condition
+) -> jax.Array:
+    """Mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
+
+    `real`, `fake`: trees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all leaves; the
+    norm is the Euclidean one over all leaves together. Otberdout et al. 2023, last term of eq 2, and eq 5; the
+    condition goes into this term too, which eq 2 leaves out. Where the gradient vanishes the norm's derivative
+    is taken as 0.
+    """
+    tau = jax.random.uniform(key, (jax.tree.leaves(real)[0].shape[0],))
+
+    def squared_slope(tau, real, fake, condition):
+        between = jax.tree.map(lambda r, f: (1.0 - tau) * r + tau * f, real, fake)
+        slope = jax.grad(score)(between, condition)
+        return sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(slope))
+
+    squared = jax.vmap(squared_slope)(tau, real, fake, condition)
+    flat = squared == 0.0  # the branch is chosen before the root, so that its derivative never sees 1 / 0
+    norm = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, squared)))
+    return jnp.mean(jnp.square(norm - 1.0))
+
+
+def critic(
+    score: Score,
+    key: jax.Array,
+    real: Sample,
+    fake: Sample,
+    condition: Condition,
+    *,
+    penalty: float = 10.0,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """What the critic minimises: E[score(fake)] - E[score(real)] + penalty * gradient penalty.
+
+    Samples and conditions have a leading axis B. Returns the loss and its terms: `wasserstein` (the estimated
+    distance, E[score(real)] - E[score(fake)]) and `slope` (the penalty before its weight).
+    Otberdout et al. 2023, eq 2, with the condition in all three terms.
+    """
+    judge = jax.vmap(score)
+    distance = jnp.mean(judge(real, condition)) - jnp.mean(judge(fake, condition))
+    slope = gradient_penalty(score, key, real, fake, condition)
+    return penalty * slope - distance, {"wasserstein": distance, "slope": slope}
+
+
+def generator(score: Score, fake: Sample, condition: Condition) -> jax.Array:
+    """The generator's adversarial term, -E[score(fake)]; samples and conditions have a leading axis B."""
+    return -jnp.mean(jax.vmap(score)(fake, condition))
+
+
+@jax.jit
+def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
+    """Mean absolute difference of two stacks of tangent vectors (..., T-1, L, 3), or of any two equal shapes.
+
+    Otberdout et al. 2023, eq 6; the mean over entries, not the sum.
+    """
+    _same_shape(predicted, target)
+    return jnp.mean(jnp.abs(predicted - target))
+
+
+@jax.jit
+def displacement_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
+    """L1 error of displacements (..., N, 3) in mm: sum over xyz, mean over vertices and leading axes.
+
+    Otberdout et al. 2023, eq 8.
+    """
+    _same_shape(predicted, target)
+    return jnp.mean(jnp.sum(jnp.abs(predicted - target), axis=-1))
+
+
+@jax.jit
+def weighted_l1(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
+    """`displacement_l1` with every vertex's error times its weight (N,); the mean still divides by N.
+
+    Otberdout et al. 2023, eq 9. Meshes or displacements alike: the neutral face cancels in the difference.
+    """
+    _same_shape(predicted, target)
+    if weights.shape != predicted.shape[-2:-1]:
+        raise ValueError(
+            f"weights must have shape {predicted.shape[-2:-1]}, one per vertex; got {weights.shape}"
+        )
+    return jnp.mean(weights * jnp.sum(jnp.abs(predicted - target), axis=-1))
+
+
+@partial(jax.jit, static_argnames="reduction")
+def s2d(
+    predicted: jax.Array,
+    target: jax.Array,
+    weights: jax.Array,
+    *,
+    beta1: float = 1.0,
+    beta2: float = 0.1,
+    reduction: str = "paper",
+) -> jax.Array:
+    """The mesh decoder's loss on displacements (..., N, 3) in mm, with vertex weights (N,).
+
+    `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure the
+    same residual, so with weights of 1 this is (beta1 + beta2) times the first term alone.
+    `reference`: as the authors' program does it: the two factors swap places, and the weighted term is a sum
+    over the vertices, so that it outweighs the other some N times.
+    """
+    plain = displacement_l1(predicted, target)
+    weighted = weighted_l1(predicted, target, weights)
+    if reduction == "paper":
+        return beta1 * plain + beta2 * weighted
+    if reduction == "reference":
+        return beta2 * plain + beta1 * weighted * predicted.shape[-2]
+    raise ValueError(f"reduction must be 'paper' or 'reference'; got {reduction!r}")
+
+
+@partial(jax.jit, static_argnames="mode")
+def landmark_weights(
+    vertices: jax.Array,
+    landmark_indices: jax.Array,
+    *,
+    mode: str = "linear",
+    edge_length: float | None = None,
+) -> jax.Array:
+    """Vertex weights (N,) in [0, 1], exactly 1 at the landmarks, falling with the distance d to the nearest one.
+
+    `vertices` (N, 3), `landmark_indices` (L,) of vertices.
+    `linear`: 1 - d / d_max, which the authors' published weights follow. `inverse`: the paper's 1 / d, held at
+    1 / edge_length nearer than that (it is infinite at the landmarks), then divided by its largest value; give
+    `edge_length` as the mean edge length of the mesh, in the unit of the vertices. `none`: 1 everywhere.
+    """
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices must have shape (N, 3); got {vertices.shape}")
+    if mode not in ("linear", "inverse", "none"):
+        raise ValueError(f"mode must be 'linear', 'inverse' or 'none'; got {mode!r}")
+    if mode == "none":
+        return jnp.ones_like(vertices[:, 0])
+    offsets = vertices[:, None] - vertices[landmark_indices]
+    distance = jnp.sqrt(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
+    if mode == "linear":
+        return 1.0 - distance / jnp.max(distance)
+    if edge_length is None:
+        raise ValueError("mode 'inverse' needs edge_length, the mean edge length of the mesh")
+    return edge_length / jnp.maximum(distance, edge_length)
+
+
+def _same_shape(predicted: jax.Array, target: jax.Array) -> None:
+    if predicted.shape != target.shape:
+        raise ValueError(
+            f"predicted and target must have one shape; got {predicted.shape} and {target.shape}"
+        )
