@@ -138,20 +138,21 @@ def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.nda
     return sums / counts[:, None, None]
 
 
-def select(peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per_pair: int) -> Selection:
+def select(
+    peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per_pair: int, reuse: int | None = None
+) -> Selection:
     """For each ordered pair of different classes, the `per_pair` transitions nearest to the two prototypes.
 
     peaks are (K, L, 3), labels (K,), prototypes (classes, L, 3). The distance of a transition is the L2 norm
-    of (start, end) - (prototype of start, prototype of end). Pairs with fewer transitions give all they have;
-    a class may be absent. Ties go to the lower indices.
+    of (start, end) - (prototype of start, prototype of end). With `reuse`, transitions are taken nearest
+    first and none whose start, or whose end, has served `reuse` times in the pair: a few peaks close to their
+    prototype would otherwise make most of the selection. Pairs with fewer transitions give all they have; a
+    class may be absent. Ties go to the lower indices.
     """
-    # A transition starts and ends at the two peaks themselves, so its squared distance is the sum of theirs.
-    # With both classes sorted, the transition of ranks (r, s) has (r+1)(s+1) - 1 others that are at least as
-    # near: the k nearest are among the O(k log k) with (r+1)(s+1) <= k, and the full product is never formed.
     prototypes = np.asarray(prototypes, np.float64)
     peaks, labels = _labelled(peaks, labels, len(prototypes))
-    if per_pair < 1:
-        raise ValueError(f"per_pair: expected at least 1, got {per_pair}")
+    if per_pair < 1 or (reuse is not None and reuse < 1):
+        raise ValueError(f"per_pair, reuse: expected at least 1, got {per_pair} and {reuse}")
     if prototypes.shape[1:] != peaks.shape[1:]:
         raise ValueError(f"prototypes: expected (classes, *{peaks.shape[1:]}), got {prototypes.shape}")
     squared = np.sum((peaks - prototypes[labels]) ** 2, axis=(1, 2))
@@ -159,17 +160,34 @@ def select(peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per
     members = [rows[np.argsort(squared[rows], kind="stable")] for rows in members]
     pairs, distances = [np.zeros((0, 2), np.int32)], [np.zeros(0)]
     for a, b in ((a, b) for a in range(len(members)) for b in range(len(members)) if a != b):
-        ranks = [
-            np.arange(min(per_pair // (r + 1), len(members[b])))
-            for r in range(min(per_pair, len(members[a])))
-        ]
-        first = members[a][np.repeat(np.arange(len(ranks)), [len(row) for row in ranks])]
-        second = members[b][np.concatenate(ranks)] if ranks else first
+        first, second = _candidates(len(members[a]), len(members[b]), per_pair, reuse)
+        first, second = members[a][first], members[b][second]
         total = squared[first] + squared[second]
         nearest = np.lexsort((second, first, total))[:per_pair]
         pairs.append(np.stack([first[nearest], second[nearest]], axis=1).astype(np.int32))
         distances.append(np.sqrt(total[nearest]))
     return Selection(np.concatenate(pairs), np.concatenate(distances))
+
+
+def _candidates(starts: int, ends: int, count: int, reuse: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Ranks (M,) of start and end among which the `count` nearest transitions are, without the full product.
+
+    A transition starts and ends at the two peaks themselves, so its squared distance is the sum of theirs:
+    both classes are sorted, and rank (r, s) is at least as far as every (r' <= r, s' <= s).
+    """
+    if reuse is None:
+        # (r, s) has (r+1)(s+1) - 1 others at least as near: those with (r+1)(s+1) <= count suffice, about
+        # count log count of them.
+        widths = np.minimum(count // np.arange(1, min(count, starts) + 1), ends)
+        first = np.repeat(np.arange(len(widths)), widths)
+        return first, np.arange(len(first)) - np.repeat(np.cumsum(widths) - widths, widths)
+    # Nearest first, the starts and ends of ranks below `reuse` take all of one another, which uses them up,
+    # and the next `reuse` ranks follow: square blocks along the diagonal, each no nearer than the one before.
+    blocks = -(-count // reuse**2)
+    ranks = np.arange(min(blocks * reuse, starts))
+    first, second = np.repeat(ranks, reuse), (ranks[:, None] // reuse * reuse + np.arange(reuse)).reshape(-1)
+    inside = second < ends
+    return first[inside], second[inside]
 
 
 def _between(tau: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:

@@ -96,7 +96,7 @@ def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
     _check_motion(samples, 1, axes=4)
     if jnp.shape(reference)[-3:] != samples.shape[-3:]:
         raise ValueError(f"reference: expected (..., {samples.shape[-3:]}), got {jnp.shape(reference)}")
-    return jnp.mean(_norm(samples - reference[..., None, :, :, :]), axis=(-4, -3, -2))
+    return jnp.mean(_norm(samples - reference[..., None, :, :, :]), axis=(-3, -2, -1))
 
 
 @jax.jit

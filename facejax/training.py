@@ -21,9 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
-from facejax import losses
 from facejax.checkpoints import Checkpoints
 from facejax.journal import Journal
 
@@ -42,108 +40,8 @@ class TrainState(NamedTuple):
     extra: Tree = ()  # such as a running average of the parameters
 
 
-class Players(NamedTuple):
-    """The two sides of the adversarial game: parameters, optimisers, or optimiser states."""
-
-    generator: Any
-    critic: Any
-
-
 class TrainingError(RuntimeError):
     """A loss that is no longer a number, or past all bounds."""
-
-
-def supervised_step(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
-    """A step down the gradient of `loss(params, key, batch, constants) -> (scalar, metrics)`."""
-
-    def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
-        key = jax.random.fold_in(state.key, state.step)
-        (value, metrics), slope = jax.value_and_grad(loss, has_aux=True)(state.params, key, batch, constants)
-        params, opt_state = _descend(optimiser, slope, state.opt_state, state.params)
-        return TrainState(state.step + 1, params, opt_state, state.key, state.extra), {
-            "loss": value,
-            **metrics,
-        }
-
-    return step
-
-
-def supervised_state(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
-    """The state that `supervised_step` starts from."""
-    return TrainState(jnp.int32(0), params, optimiser.init(params), key)
-
-
-def adversarial_step(
-    generate: Callable,
-    score: Callable,
-    optimisers: Players,
-    *,
-    critic_steps: int = 5,
-    penalty: float = 10.0,
-    terms: Callable | None = None,
-    decay: float = 0.999,
-) -> Step:
-    """A Wasserstein step with gradient penalty: `critic_steps` steps of the critic, then one of the generator.
-
-    `generate(weights, constants, key, condition) -> sample` and `score(weights, constants, sample, condition)
-    -> scalar` handle ONE sample. A batch is (real samples, conditions) with a leading axis of critic_steps * B; each
-    critic step takes B of them, and the generator sees the last B. `terms(constants, fake, real, condition)` gives a
-    dict of weighted batch losses to add to the generator's. `extra` of the state is the exponential moving average of
-    the generator's weights: with a critic that never settles, the average is better than any single point.
-    """
-
-    def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
-        generator, critic = state.params
-        noise_key, chord_key, play_key = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
-        size = jax.tree.leaves(batch)[0].shape[0]
-        if size % critic_steps:
-            raise ValueError(f"a batch needs a multiple of critic_steps = {critic_steps} samples; got {size}")
-        many = jax.vmap(generate, (None, None, 0, 0))
-
-        # One call for the fakes of all critic steps: the generator does not move meanwhile.
-        fake = many(generator, constants, jax.random.split(noise_key, size), batch[1])
-        rounds = jax.tree.map(lambda leaf: leaf.reshape(critic_steps, -1, *leaf.shape[1:]), (*batch, fake))
-
-        def judge(carry, data):
-            critic, opt_state = carry
-            key, (real, condition, fake) = data
-
-            def loss(critic):
-                return losses.critic(
-                    lambda sample, condition: score(critic, constants, sample, condition),
-                    key, real, fake, condition, penalty=penalty,
-                )  # fmt: skip
-
-            slope, metrics = jax.grad(loss, has_aux=True)(critic)
-            return _descend(optimisers.critic, slope, opt_state, critic), metrics
-
-        keys = jax.random.split(chord_key, critic_steps)
-        (critic, critic_state), judged = jax.lax.scan(judge, (critic, state.opt_state.critic), (keys, rounds))
-
-        real, condition, _ = jax.tree.map(lambda leaf: leaf[-1], rounds)
-
-        def play(generator):
-            fake = many(generator, constants, jax.random.split(play_key, size // critic_steps), condition)
-            adversarial = losses.generator(lambda *x: score(critic, constants, *x), fake, condition)
-            added = terms(constants, fake, real, condition) if terms else {}
-            return adversarial + sum(added.values()), {"adversarial": adversarial, **added}
-
-        slope, played = jax.grad(play, has_aux=True)(generator)
-        generator, generator_state = _descend(
-            optimisers.generator, slope, state.opt_state.generator, generator
-        )
-        average = optax.incremental_update(generator, state.extra, 1.0 - decay)
-        opt_state = Players(generator_state, critic_state)
-        state = TrainState(state.step + 1, Players(generator, critic), opt_state, state.key, average)
-        return state, {**jax.tree.map(jnp.mean, judged), **played}
-
-    return step
-
-
-def adversarial_state(params: Players, optimisers: Players, key: jax.Array) -> TrainState:
-    """The state that `adversarial_step` starts from."""
-    opt_state = Players(*(optimiser.init(side) for optimiser, side in zip(optimisers, params, strict=True)))
-    return TrainState(jnp.int32(0), params, opt_state, key, extra=params.generator)
 
 
 def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.ndarray]:
@@ -233,11 +131,6 @@ def run(
     if stopped:
         raise KeyboardInterrupt if stopped[0] == signal.SIGINT else SystemExit(128 + stopped[0])
     return state
-
-
-def _descend(optimiser, slope: Tree, opt_state: Tree, params: Tree) -> tuple[Tree, Tree]:
-    updates, opt_state = optimiser.update(slope, opt_state, params)
-    return optax.apply_updates(params, updates), opt_state
 
 
 def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int | None, folder: Path) -> None:

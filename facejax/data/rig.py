@@ -26,7 +26,7 @@ LEVELS = (0, 1, 2, 3)
 SATURATION = 0.35  # f(w) = (1 + k) w / (1 + k |w|): f(1) = 1, f(0.5) = 0.57
 JAW_LANDMARKS = (0, 16)  # beside the ears: the hinge lies behind them
 HINGE_OFFSET = np.array([0.0, -8.0, -8.0])
-ANCHOR = 1e-4  # weight of "stay at the plain offset" in deformation transfer, against the gradient term
+ANCHOR = 1e-7  # weight of "stay at the plain offset" in deformation transfer, against the gradient term
 
 
 class Rig(NamedTuple):
@@ -114,7 +114,10 @@ def _units(ethnicity: np.ndarray) -> np.ndarray:
 
 
 def _split_jaw(neutral: np.ndarray, offset: np.ndarray, hinge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opening as rotation about x by an angle per vertex (M,), and the rest (M, 3), linear in the weight."""
+    """Opening as rotation about x by an angle per vertex (M,), and what remains (M, 3), linear in the weight.
+
+    The remainder rides along with the rotation, so it is given in the frame before it.
+    """
     before = neutral - hinge
     after = before + offset
     cross = before[:, 1] * after[:, 2] - before[:, 2] * after[:, 1]
@@ -122,7 +125,7 @@ def _split_jaw(neutral: np.ndarray, offset: np.ndarray, hinge: np.ndarray) -> tu
     angle = np.where(np.linalg.norm(offset, axis=1) > 0, np.arctan2(cross, dot), 0.0)
     # Close to the hinge a tiny offset can mean any angle: let its share fade out within 25 mm.
     angle *= np.clip(np.linalg.norm(before[:, 1:], axis=1) / 25.0, 0, 1) ** 2
-    return angle, after - _rotate_x(before, angle)
+    return angle, _rotate_x(after, -angle) - before
 
 
 def _rotate_x(points: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ NaN; a point that is zero, as a motion at standstill is, has logarithm and dista
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -146,33 +148,7 @@ def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = N
         raise ValueError(f"steps: expected at least 1, got {steps}")
     tolerance = 16 * jnp.finfo(qs.dtype).eps if tolerance is None else tolerance
 
-    def pull(p: jax.Array) -> jax.Array:
-        return jnp.mean(log(p[..., None, :, :, :], qs), axis=-4)
-
-    def stationary(p: jax.Array) -> jax.Array:
-        # The second term holds p to the sphere and makes the Jacobian regular along p.
-        return _wide(inner(p, p) - 1) * p - pull(p)
-
-    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        step, _, v = carry
-        return (step < steps) & jnp.any(norm(v) > tolerance)
-
-    def move(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        step, p, v = carry
-        p = exp(p, v)
-        # Hundreds of steps would add up their rounding in the length of p.
-        p = p / _wide(norm(p))
-        return step + 1, p, pull(p)
-
-    def solve(_, start: jax.Array) -> jax.Array:
-        return lax.while_loop(unfinished, move, (0, start, pull(start)))[1]
-
-    def tangent_solve(jacobian, y: jax.Array) -> jax.Array:
-        # The Jacobian at the root is the Hessian of the objective plus 2 p p': symmetric, with K + 2 distinct
-        # eigenvalues at most, so that conjugate gradients end after as many steps.
-        return jax.scipy.sparse.linalg.cg(jacobian, y, tol=4 * jnp.finfo(y.dtype).eps, maxiter=100)[0]
-
-    return lax.custom_root(stationary, lax.stop_gradient(extrinsic_mean(qs)), solve, tangent_solve)
+    return _karcher(steps, qs, jnp.asarray(tolerance, qs.dtype))
 
 
 def _check(*points: jax.Array) -> None:
@@ -220,3 +196,45 @@ def _fixed_direction(p: jax.Array) -> jax.Array:
     leans = jnp.abs(p[..., 0, 0, 0]) > jnp.abs(p[..., 0, 0, 1])
     direction = project(p, jnp.where(_wide(leans), second, first))
     return lax.stop_gradient(direction / _wide(norm(direction)))
+
+
+def _pull(p: jax.Array, qs: jax.Array) -> jax.Array:
+    """The mean of log(p, qs) over the points: minus the gradient of half the mean squared distance."""
+    return jnp.mean(log(p[..., None, :, :, :], qs), axis=-4)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _karcher(steps: int, qs: jax.Array, tolerance: jax.Array) -> jax.Array:
+    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        step, _, v = carry
+        return (step < steps) & jnp.any(norm(v) > tolerance)
+
+    def move(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        step, p, v = carry
+        p = exp(p, v)
+        # Many steps would add up their rounding in the length of p.
+        p = p / _wide(norm(p))
+        return step + 1, p, _pull(p, qs)
+
+    start = extrinsic_mean(qs)
+    return lax.while_loop(unfinished, move, (0, start, _pull(start, qs)))[1]
+
+
+@_karcher.defjvp
+def _karcher_jvp(steps: int, primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+    qs, tolerance = primals
+    p = _karcher(steps, qs, tolerance)
+
+    def hessian(x: jax.Array) -> jax.Array:
+        # The identity along p; at tangent vectors the derivative of -pull, with K + 1 distinct eigenvalues at
+        # most.
+        u = project(p, x)
+        return x - u - project(p, jax.jvp(lambda p: _pull(p, qs), (p,), (u,))[1])
+
+    def solve(matvec, b: jax.Array) -> jax.Array:
+        return jax.scipy.sparse.linalg.cg(matvec, b, tol=4 * jnp.finfo(b.dtype).eps, maxiter=100)[0]
+
+    # pull(p, qs) = 0, differentiated: hessian(dp) = d pull / d qs. A bare `cg` cannot be transposed under jit
+    # (it ties its starting point to b), so the linear solve is declared around it.
+    _, change = jax.jvp(lambda qs: _pull(p, qs), (qs,), (tangents[0],))
+    return p, lax.custom_linear_solve(hessian, change, solve, symmetric=True)

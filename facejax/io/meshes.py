@@ -81,7 +81,7 @@ def read(path: str | os.PathLike) -> Mesh:
 
 
 def write(path: str | os.PathLike, vertices, faces=None) -> None:
-    """Writes a mesh by suffix (.ply binary, .obj text, .npz), atomically; floats come back bit for bit.
+    """Writes a mesh by suffix (.ply binary, .obj text, .npz), atomically; numbers come back bit for bit.
 
     Args:
       vertices: (N, 3).

@@ -95,7 +95,7 @@ def _span(plane: np.ndarray, face: np.ndarray, row: np.ndarray) -> tuple[np.ndar
     left, right = np.full(len(face), -np.inf), np.full(len(face), np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for a, b, c in plane.transpose(1, 0, 2):
-            slope = a[face]
+            slope = a[face] + 0.0  # -0 would divide to the wrong infinity
             crossing = -(b[face] * row + c[face]) / slope
             # A level edge (slope 0) divides to +inf (row outside), -inf (inside) or nan (on it: all inside).
             np.fmax(left, np.where(slope >= 0, crossing, -np.inf), out=left)

@@ -8,9 +8,11 @@ ms at 256 x 320 pixels on one core.
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from facejax.io import props, raster, scene, shade
+from facejax.io.sheet import caption, contact_sheet
+
+__all__ = ["Camera", "aim", "caption", "contact_sheet", "frames", "heat", "image"]
 
 SKIN_GLOSS = 0.30
 LANDMARK = (0.02, 0.55, 0.80)
@@ -108,75 +110,6 @@ def frames(
 def image(vertices, faces, *, landmarks=None, **options) -> np.ndarray:
     """One picture, (height, width, 3) uint8, of vertices (N, 3); options as of `frames`."""
     return frames(np.asarray(vertices)[None], faces, landmarks=landmarks, **options)[0]
-
-
-def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.ndarray:
-    """Pictures in a labelled grid, (height, width, 3) uint8.
-
-    Args:
-      rows: rows of pictures, each (h, w, 3) uint8, all of one size; a row may be short.
-      row_labels, column_labels: texts, as many as rows and columns.
-      gap: pixels between pictures.
-    """
-    rows = [list(row) for row in rows]
-    columns = max((len(row) for row in rows), default=0)
-    if not columns:
-        raise ValueError("a contact sheet needs at least one picture")
-    shape = next(np.shape(row[0]) for row in rows if row)
-    row_labels, column_labels = ([_printable(t) for t in x or ()] for x in (row_labels, column_labels))
-    for name, labels, count in (("row", row_labels, len(rows)), ("column", column_labels, columns)):
-        if labels and len(labels) != count:
-            raise ValueError(f"expected {count} {name} labels, got {len(labels)}")
-    height, width = shape[:2]
-    font = ImageFont.load_default(size=max(11, min(height, width) // 14))
-    row_boxes = [font.getbbox(text) for text in row_labels]
-    left = int(max((box[2] for box in row_boxes), default=-8)) + 12 if row_labels else gap
-    line = int(sum(font.getmetrics()) * 1.5)
-    top = line if column_labels else gap
-    sheet = Image.new("RGB", (left + columns * (width + gap), top + len(rows) * (height + gap)), "white")
-    pen = ImageDraw.Draw(sheet)
-    for j, text in enumerate(column_labels):
-        pen.text((left + j * (width + gap) + width / 2, top / 2), text, "#222222", font, "mm")
-    for i, row in enumerate(rows):
-        y = top + i * (height + gap)
-        if row_labels:
-            pen.text((left - 6, y + height / 2), row_labels[i], "#222222", font, "rm")
-        for j, picture in enumerate(row):
-            if np.shape(picture) != shape:
-                raise ValueError(f"picture [{i}][{j}] must be {shape} as the first, got {np.shape(picture)}")
-            sheet.paste(Image.fromarray(np.asarray(picture, np.uint8)), (left + j * (width + gap), y))
-    return np.asarray(sheet)
-
-
-def caption(pictures, captions) -> np.ndarray:
-    """Adds a strip below the frames with the text of the moment.
-
-    Args:
-      pictures: (T, H, W, 3) uint8.
-      captions: ((first frame, text), ...) by rising frame; each holds until the next.
-
-    Returns:
-      (T, H + strip, W, 3) uint8, of even height.
-    """
-    pictures = np.asarray(pictures)
-    count, height, width = pictures.shape[:3]
-    strip = max(16, height // 12) // 2 * 2 + height % 2
-    result = np.full((count, height + strip, width, 3), 255, np.uint8)
-    result[:, :height] = pictures
-    bounds = [start for start, _ in captions] + [count]
-    for (start, text), stop in zip(captions, bounds[1:], strict=True):
-        text, size = _printable(text), strip * 6 // 10
-        while (font := ImageFont.load_default(size=size)).getlength(text) > 0.94 * width and size > 6:
-            size -= 1
-        band = Image.new("RGB", (width, strip), "white")
-        ImageDraw.Draw(band).text((width / 2, strip / 2), text, "#20242a", font, "mm")
-        result[start:stop, height:] = np.asarray(band)
-    return result
-
-
-def _printable(text: str) -> str:
-    """Pillow's built-in font has no arrow."""
-    return text.replace("→", "to")
 
 
 def heat(values, *, low=0.0, high=None) -> np.ndarray:

@@ -173,7 +173,7 @@ def test_antipode_follows_a_fixed_direction(dtype):
         np.testing.assert_allclose(sphere.inner(p, v), 0, atol=10 * EPS[dtype])
         np.testing.assert_allclose(sphere.distance(p, -p), np.pi, rtol=4 * EPS[dtype])
         np.testing.assert_allclose(sphere.geodesic(p, -p, 1.0), -p, atol=10 * EPS[dtype])
-        np.testing.assert_allclose(sphere.transport(p, -p, v), -sphere.log(-p, p), atol=40 * EPS[dtype])
+        np.testing.assert_allclose(sphere.transport(p, -p, v), -sphere.log(-p, p), atol=100 * EPS[dtype])
 
 
 def test_transport_approaches_its_value_at_the_antipode(x64):
@@ -252,8 +252,8 @@ def test_extrinsic_mean_against_a_loop(x64):
     np.testing.assert_array_equal(sphere.extrinsic_mean(jnp.stack([qs[0], -qs[0]])), qs[0])
 
 
-def cluster(seed, count, spread):
-    centre = points(seed, 1)[0]
+def cluster(seed, count, spread, dtype=jnp.float64):
+    centre = points(seed, 1, dtype)[0]
     return jnp.stack([sphere.exp(centre, tangent(seed + k, centre, spread)) for k in range(1, count + 1)])
 
 
@@ -279,7 +279,7 @@ def test_karcher_mean_against_gradient_descent(x64):
 
 
 def test_karcher_mean_is_stationary_equivariant_and_a_midpoint(dtype):
-    qs = jnp.asarray(cluster(21, 6, 1.0), dtype)
+    qs = cluster(21, 6, 1.0, dtype)
     mean = sphere.karcher_mean(qs)
     np.testing.assert_allclose(sphere.norm(mean), 1, rtol=4 * EPS[dtype])
     assert sphere.norm(jnp.mean(sphere.log(mean, qs), axis=0)) < 40 * EPS[dtype]

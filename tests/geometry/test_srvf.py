@@ -166,8 +166,8 @@ def test_gradient_of_a_pause_is_finite_and_that_of_the_pause_itself_zero(double)
         _, pull = jax.vjp(lambda steps: srvf.encode(jnp.cumsum(steps, axis=0))[0], jnp.diff(paused, axis=0))
         gradient = pull(jnp.ones((4, 4, 3)))[0]
         assert np.isfinite(gradient).all()
-        # The length still depends on no direction of a zero step, so nothing at all flows into it.
-        np.testing.assert_array_equal(gradient[2], 0)
+        # Differences of running sums: nothing but rounding flows into the step that is zero.
+        np.testing.assert_allclose(gradient[2], 0, atol=1e-14 if double else 1e-6)
         for size in (1e-5, 1e-12, 1e-18, 1e-30):
             moved = jnp.zeros_like(curve).at[3:, 0, 0].set(size).at[4:, 1, 1].set(1.0)
             assert np.isfinite(jax.grad(encode_loss)(moved)).all(), size

@@ -1,4 +1,4 @@
-"""Mesh files: exact round trips, foreign dialects, and one clear line for every way in which a file can be bad."""
+"""Mesh files: exact round trips, foreign dialects; a bad file is refused in one clear line."""
 
 import struct
 

@@ -1,0 +1,124 @@
+"""What all experiments share: flags, the output folder, and the record of how a result was made.
+
+An experiment has a frozen `Config` with `out`, `seed` and `publish`, and `run(config) -> metrics`. It writes
+`runs/NAME/{config.json, metrics.json, table.md, *.png}`; with `--publish` the figures that the README quotes go to
+`experiments/results/NAME.{json,md,png}` as well.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+import tyro
+
+from facejax.data import cache
+
+RESULTS = Path(__file__).parent / "results"
+Config = TypeVar("Config")
+
+
+def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str, Any]]) -> None:
+    """Parse the command line, run, and say where the results are. Bad input: one line, exit code 2."""
+    description = sys.modules[run.__module__].__doc__
+    config = tyro.cli(config_type, prog=f"python -m experiments.{name}", description=description)
+    compile_cache()
+    try:
+        run(config)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"experiments.{name}: {error}", file=sys.stderr)
+        raise SystemExit(2) from error
+    print(f"results in {config.out}")
+
+
+def compile_cache() -> None:
+    """Keep compiled programs between runs."""
+    jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Command, commit, machine, seed, seconds and dataset version of a result."""
+    module = sys.modules["__main__"].__spec__
+    command = ["python", "-m", module.name] if module else ["python", Path(sys.argv[0]).name]
+    return {
+        "command": shlex.join(command + sys.argv[1:]),
+        "commit": _commit(),
+        "machine": {
+            "processor": _processor(),
+            "cores": os.cpu_count(),
+            "device": jax.devices()[0].device_kind,
+            "python": platform.python_version(),
+            "jax": jax.__version__,
+            "numpy": np.__version__,
+        },
+        "seed": config.seed,
+        "seconds": round(seconds, 1),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "dataset": dataset,
+    }
+
+
+def finish(
+    name: str, config: Any, metrics: dict[str, Any], *, made: dict[str, Any], table: str, figure: Path | None = None
+) -> None:
+    """Write the config, the metrics with their record, and the table; publish them if asked."""
+    out = Path(config.out)
+    document = {**metrics, "made": made}
+    plain = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(config).items()}
+    write_text(out / "config.json", json.dumps(plain, indent=1) + "\n")
+    write_text(out / "metrics.json", json.dumps(document, indent=1, default=_plain) + "\n")
+    body = f"{table}\n\nMade by `{made['command']}` in {made['seconds']:.0f} s (commit {made['commit']}, {made['date']}).\n"
+    write_text(out / "table.md", body)
+    if config.publish:
+        write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
+        write_text(RESULTS / f"{name}.md", body)
+        if figure is not None:
+            with cache.atomic_path(RESULTS / f"{name}{figure.suffix}") as temporary:
+                temporary.write_bytes(figure.read_bytes())
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A Markdown table; numbers to three significant decimals."""
+
+    def cell(value: Any) -> str:
+        return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(cell(v) for v in row) + " |" for row in rows])
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all."""
+    with cache.atomic_path(path) as temporary:
+        temporary.write_text(text)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _commit() -> str:
+    done = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=RESULTS.parent, check=False
+    )
+    return done.stdout.strip() or "unknown"
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

@@ -1,0 +1,59 @@
+"""Eyes and teeth for a face that came without: the template's, fitted to its landmarks.
+
+They are for the eye alone: nothing is learnt from them or measured on them. iBUG's 68 landmarks are assumed; millimetres.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from facejax.geometry import align
+from facejax.io import props, scene
+
+EYES = (range(42, 48), range(36, 42))  # landmarks of the left and right eye
+MOUTH = (*range(31, 36), *range(48, 68))
+JAW = range(4, 13)
+IBUG = 68
+
+
+class Props(NamedTuple):
+    """The template's eyes and teeth, beside its landmarks."""
+
+    landmarks: np.ndarray  # (68, 3)
+    eye_centre: np.ndarray  # (2, 3) left, right
+    eye_radius: np.ndarray  # (2,)
+    upper_teeth: np.ndarray  # (P, 3)
+    upper_faces: np.ndarray  # (K, 3)
+    lower_teeth: np.ndarray  # (P, 3)
+    lower_faces: np.ndarray  # (K, 3)
+
+
+def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[scene.Part, ...]:
+    """Eyeballs and teeth of a face with neutral landmarks (68, 3) that moves through landmarks (T, 68, 3).
+
+    Each eye is placed by its own lids, the teeth by nose and mouth; the lower teeth go with the jaw. None for another
+    landmark scheme.
+    """
+    neutral, landmarks = np.asarray(neutral, np.float32), np.asarray(landmarks, np.float32)
+    if neutral.shape != (IBUG, 3):
+        return ()
+    found = []
+    for side, lids in enumerate(EYES):
+        fit = _fit(template.landmarks, neutral, lids, scaling=True)
+        centre = np.asarray(align.apply(fit, template.eye_centre[side : side + 1]))[0]
+        radius = float(fit.scale) * float(template.eye_radius[side])
+        found.append(props.eyeball(centre, radius, iris_radius=min(5.9, 0.45 * radius)))
+    fit = _fit(template.landmarks, neutral, MOUTH, scaling=True)
+    upper, lower = (np.asarray(align.apply(fit, teeth)) for teeth in (template.upper_teeth, template.lower_teeth))
+    jaw = np.broadcast_to(neutral, landmarks.shape)
+    moving = np.asarray(align.apply(_fit(jaw, landmarks, JAW, scaling=False), np.broadcast_to(lower, (len(landmarks), *lower.shape))))
+    found.append(scene.Part(upper, template.upper_faces, props.TEETH, 0.6))
+    found.append(scene.Part(moving, template.lower_faces, props.TEETH, 0.6))
+    return tuple(found)
+
+
+def _fit(source: np.ndarray, target: np.ndarray, which, *, scaling: bool) -> align.Similarity:
+    index = np.array(list(which))
+    return align.procrustes(source[..., index, :], target[..., index, :], scaling=scaling)

@@ -1,0 +1,120 @@
+"""One call for every format: the suffix decides."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from facejax.io import files, film, gltf, meshes, page, render, scene
+
+STRIP = 8  # pictures on a contact strip
+
+
+def save(
+    path: str | os.PathLike,
+    vertices,
+    faces,
+    *,
+    fps=30.0,
+    captions=(),
+    title=None,
+    landmarks=None,
+    extras=(),
+    colours=None,
+    size=(320, 400),
+    camera=None,
+) -> None:
+    """Saves an animation or a still face, atomically, in the format that the path asks for.
+
+    `.glb` animated glTF; `.html` viewer in one file; `.webp`, `.gif`, `.mp4` film; `.png` picture, or a
+    strip of eight pictures of an animation; `.npz` arrays; `.ply`, `.obj` one mesh; a folder, or a path
+    that ends in "/", one PLY per frame. An option that a format cannot show is left out.
+
+    Args:
+      path: where to.
+      vertices: (T, N, 3) or (N, 3) mm.
+      faces: (F, 3).
+      fps: frames per second.
+      captions: ((first frame, text), ...); each holds until the next.
+      title: heading of the page and name in glTF; the file's name without.
+      landmarks: (T, L, 3) positions or (L,) vertex indices; drawn in pictures, on demand in the page.
+      extras: parts beside the face, see `scene.Part`.
+      colours: (N, 3) sRGB in [0, 1]; also (T, N, 3) in pictures.
+      size: (width, height) of pictures.
+      camera: of pictures, see `render.aim`.
+
+    Raises:
+      ValueError: unknown suffix, a scene out of order, or an animation in a format for one mesh.
+    """
+    name, path = os.fspath(path), Path(path)
+    shot = scene.make(vertices, faces, fps=fps, captions=captions, landmarks=landmarks, extras=extras)
+    title = path.stem if title is None else title
+    suffix = path.suffix.lower()
+    if name.endswith(("/", os.sep)) or path.is_dir():
+        meshes.write_sequence(path, shot.vertices, shot.faces)
+    elif suffix == ".glb":
+        gltf.write(path, *shot[:2], fps=fps, captions=captions, extras=extras, name=title)
+    elif suffix == ".html":
+        texts = {"fps": fps, "captions": captions, "title": title}
+        page.write(path, *shot[:2], **texts, landmarks=shot.landmarks, extras=extras, colours=colours)
+    elif suffix in film.FORMATS or suffix == ".png":
+        if suffix != ".png":
+            film.check(path)
+        view = render.aim(shot.vertices, size=size) if camera is None else camera
+        look = {"size": size, "camera": view}
+        if suffix == ".png":
+            _write_picture(path, shot, colours, look)
+        else:
+            pictures = _pictures(shot, colours, look)
+            film.write(path, render.caption(pictures, shot.captions) if shot.captions else pictures, fps=fps)
+    elif suffix == ".npz":
+        _write_arrays(path, shot)
+    elif suffix in (".ply", ".obj"):
+        if len(shot.vertices) > 1:
+            raise ValueError(
+                f"{path}: {suffix} holds one mesh, got {len(shot.vertices)} frames; end the path in '/'"
+            )
+        meshes.write(path, shot.vertices[0], shot.faces)
+    else:
+        known = ".glb .html .webp .gif .mp4 .png .npz .ply .obj, or a folder ending in '/'"
+        raise ValueError(f"{path}: unknown format {suffix!r}; expected {known}")
+
+
+def _pictures(shot: scene.Scene, colours, look: dict) -> np.ndarray:
+    return render.frames(*shot[:2], landmarks=shot.landmarks, extras=shot.extras, colours=colours, **look)
+
+
+def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
+    count = len(shot.vertices)
+    chosen = np.unique(np.linspace(0, count - 1, STRIP).round().astype(int))
+    if colours is not None and np.ndim(colours) == 3:
+        colours = np.asarray(colours)[chosen]
+    extras = [
+        part._replace(vertices=part.vertices[chosen]) if part.vertices.ndim == 3 else part
+        for part in shot.extras
+    ]
+    marks = None if shot.landmarks is None else shot.landmarks[chosen]
+    still = shot._replace(vertices=shot.vertices[chosen], landmarks=marks, extras=extras)
+    pictures = _pictures(still, colours, look)
+    if count > 1:
+        labels = [_label(t, shot.captions) for t in chosen]
+        pictures = [render.contact_sheet([pictures], column_labels=labels)]
+    with files.replacing(path) as temporary:
+        Image.fromarray(pictures[0]).save(temporary)
+
+
+def _label(frame: int, captions) -> str:
+    """The frame's number, counted from 1, and the caption that holds there."""
+    return ": ".join([str(frame + 1)] + [text for start, text in captions if start <= frame][-1:])
+
+
+def _write_arrays(path: Path, shot: scene.Scene) -> None:
+    if len(shot.vertices) == 1:
+        meshes.write(path, shot.vertices[0], shot.faces)
+        return
+    arrays = {"vertices": shot.vertices, "faces": shot.faces.astype(np.int32), "fps": np.float64(shot.fps)}
+    if shot.landmarks is not None:
+        arrays["landmarks"] = shot.landmarks
+    with files.replacing(path) as temporary:
+        np.savez(temporary, **arrays)

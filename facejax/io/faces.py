@@ -1,0 +1,107 @@
+"""A user's neutral face, brought to the model's topology, millimetres, y up and z forward.
+
+Accepted: a mesh of the model's own vertices, or a whole MakeHuman body (19,158 vertices with its helpers, 13,380
+without), as MakeHuman and Blender's MPFB export it. Units and the up axis are recognised by comparing the landmarks with
+the template's, and said aloud; the face stays where it is otherwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from typing import NamedTuple
+
+import numpy as np
+
+from facejax.io import meshes
+
+UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
+SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
+
+
+class Topology(NamedTuple):
+    """What a face is compared with."""
+
+    vertices: np.ndarray  # (N, 3) the template at rest, mm
+    landmark_index: np.ndarray  # (L,) vertices
+    source_index: np.ndarray  # (N,) vertices of MakeHuman's body
+
+
+class Face(NamedTuple):
+    """vertices: (N, 3) float32 mm. notes: what was assumed, one line each."""
+
+    vertices: np.ndarray
+    notes: tuple[str, ...]
+
+
+def read(path: str | os.PathLike, topology: Topology) -> Face:
+    """Read a neutral face. Raises `meshes.MeshError` for a damaged file, another topology, or an unknown unit."""
+    return fit(meshes.read(path).vertices, topology, name=str(path))
+
+
+def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> Face:
+    """Bring vertices (V, 3) in any accepted topology, unit and axis order to the model's."""
+    vertices, notes = np.asarray(vertices, np.float64), []
+    count, bodies = len(topology.vertices), (13_380, 19_158)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise meshes.MeshError(f"{name}: vertices must be ({count}, 3), got {vertices.shape}")
+    if len(vertices) in bodies and len(vertices) != count and len(topology.source_index):
+        vertices = vertices[topology.source_index]
+        notes.append(f"took the head's {count} vertices of a MakeHuman body")
+    if len(vertices) != count:
+        raise meshes.MeshError(
+            f"{name}: {len(vertices)} vertices, expected {count} (the model's topology)"
+            + (f", or {bodies[0]} or {bodies[1]} (a MakeHuman body)" if len(topology.source_index) else "")
+            + "; `facejax data makehuman --sample DIR` writes faces to try"
+        )
+    bad = ~np.isfinite(vertices).all(axis=1)
+    if bad.any():
+        raise meshes.MeshError(
+            f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}"
+        )
+    turn = _axes(vertices[topology.landmark_index], topology.vertices[topology.landmark_index], name)
+    if not np.array_equal(turn, np.eye(3)):
+        vertices = vertices @ turn.T
+        notes.append(
+            f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"
+        )
+    size = _spread(vertices[topology.landmark_index]) / _spread(topology.vertices[topology.landmark_index])
+    for unit, millimetres in UNITS.items():
+        if SIZE_RANGE[0] <= size * millimetres <= SIZE_RANGE[1]:
+            if unit != "millimetres":
+                notes.append(f"read as {unit}")
+            return Face((vertices * millimetres).astype(np.float32), tuple(notes))
+    raise meshes.MeshError(
+        f"{name}: the face is {size:.3g} times as large as a head in millimetres; expected one in {', '.join(UNITS)}"
+    )
+
+
+def _spread(points: np.ndarray) -> float:
+    return float(np.linalg.norm(points - points.mean(axis=0)))
+
+
+def _axes(points: np.ndarray, target: np.ndarray, name: str) -> np.ndarray:
+    """Of the 24 rotations that permute the axes, the one under which the landmarks look most like the template's."""
+    if _spread(points) == 0:
+        raise meshes.MeshError(f"{name}: all landmarks coincide: this is no face")
+    shape, wanted = ((p - p.mean(axis=0)) / _spread(p) for p in (points, target))
+    turns = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0:
+                turns.append(turn)
+    turns.sort(key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
+    best = np.linalg.norm(shape @ turns[0].T - wanted)
+    if best > 0.6:
+        raise meshes.MeshError(
+            f"{name}: its landmarks do not form a face (distance {best:.2f} of at most 0.6): the right number of "
+            "vertices, but in another order?"
+        )
+    return turns[0]
+
+
+def _axis_name(row: np.ndarray) -> str:
+    at = int(np.argmax(np.abs(row)))
+    return ("-" if row[at] < 0 else "") + "xyz"[at]

@@ -1,0 +1,96 @@
+"""Coarser meshes on a subset of the vertices, and the way back up.
+
+`decimate` merges vertices by quadric edge collapse (Garland and Heckbert 1997, fast-simplification) and keeps of every
+merged group the member nearest to where the group came to lie. `upsampling` writes every fine vertex as a barycentric
+combination of three coarse ones.
+"""
+
+from __future__ import annotations
+
+import fast_simplification
+import numpy as np
+
+from facejax.mesh import graph
+
+
+def decimate(
+    vertices: np.ndarray, faces: np.ndarray, factor: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """About N / factor vertices: those kept (M,) ascending, faces (G, 3) over them, and each vertex's group (N,).
+
+    Raises `ValueError` when the mesh cannot be made that much coarser.
+    """
+    if factor <= 1:
+        raise ValueError(f"factor: expected more than 1, got {factor}")
+    # The library's error thresholds are absolute: measured in edge lengths, the result does not depend on the unit.
+    pairs = graph.edges(faces)
+    scaled = vertices / np.mean(np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1))
+    _, _, collapses = fast_simplification.simplify(
+        scaled, faces, target_reduction=1 - 1 / factor, return_collapses=True
+    )
+    points, coarse, group = fast_simplification.replay_simplification(scaled, faces, collapses)
+    if len(coarse) == 0 or len(points) > 0.9 * len(vertices):
+        raise ValueError(
+            f"a mesh of {len(vertices)} vertices and {len(faces)} faces cannot be made {factor} times coarser"
+        )
+    # The member nearest to its group's new position, the first of equals: sort by (group, distance).
+    distance = np.linalg.norm(scaled - points[group], axis=1)
+    order = np.lexsort((distance, group))
+    members = order[np.flatnonzero(np.diff(group[order], prepend=-1))]
+    used = np.unique(coarse)
+    rank = np.full(len(points), -1)
+    kept = np.sort(members[used])
+    rank[used] = np.searchsorted(kept, members[used])
+    return kept.astype(np.int32), rank[coarse].astype(np.int32), rank[group].astype(np.int32)
+
+
+def upsampling(
+    vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest point on a coarse mesh.
+
+    Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some order. Exact: a
+    triangle is passed over only if its bounding sphere lies beyond a point already found.
+    """
+    triangles = coarse[faces]
+    centre = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - centre[:, None], axis=2).max(axis=1)
+    corners = np.empty((len(vertices), 3), np.int32)
+    weights = np.empty((len(vertices), 3), np.float32)
+    for start in range(0, len(vertices), 256):  # 256 x G distances at a time
+        points = vertices[start : start + 256]
+        to_centre = np.linalg.norm(points[:, None] - centre, axis=2)
+        reach = np.min(to_centre + radius, axis=1, keepdims=True)
+        row, triangle = np.nonzero(to_centre - radius <= reach * (1 + 1e-9))
+        found = closest_point(points[row], triangles[triangle])
+        distance = np.linalg.norm(np.einsum("pc,pcx->px", found, triangles[triangle]) - points[row], axis=1)
+        order = np.lexsort((distance, row))
+        best = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
+        corners[start : start + 256] = faces[triangle[best]]
+        weights[start : start + 256] = found[best]
+    # Rounding leaves corners of 1e-16; without them a kept vertex maps to itself exactly.
+    weights[weights < 1e-6] = 0
+    return corners, weights / weights.sum(axis=1, keepdims=True)
+
+
+def closest_point(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Barycentric weights (P, 3) of the point of each triangle (P, 3, 3) closest to each point (P, 3).
+
+    The foot of the perpendicular where it falls inside; otherwise the best of the closest points of the three edges.
+    """
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    candidates = np.empty((4, len(points), 3))
+    for edge, (start, end) in enumerate(((a, b), (b, c), (c, a))):
+        along = end - start
+        t = np.sum((points - start) * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-300)
+        t = np.clip(t, 0, 1)
+        candidates[edge] = np.roll(np.stack([1 - t, t, np.zeros_like(t)], axis=1), edge, axis=1)
+    normal = np.cross(b - a, c - a)
+    square = np.maximum(np.sum(normal**2, axis=1), 1e-300)
+    inside_b = np.sum(np.cross(points - a, c - a) * normal, axis=1) / square
+    inside_c = np.sum(np.cross(b - a, points - a) * normal, axis=1) / square
+    candidates[3] = np.stack([1 - inside_b - inside_c, inside_b, inside_c], axis=1)
+    distance = np.linalg.norm(np.einsum("kpc,pcx->kpx", candidates, triangles) - points, axis=2)
+    outside = (candidates[3] < 0).any(axis=1) | (np.sum(normal**2, axis=1) == 0)
+    distance[3, outside] = np.inf
+    return np.take_along_axis(candidates, np.argmin(distance, axis=0)[None, :, None], axis=0)[0]

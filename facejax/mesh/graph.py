@@ -1,0 +1,81 @@
+"""The mesh as a graph: edges, ordered vertex rings, geodesic distances.
+
+N vertices, F triangles. A triangle's corners run counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csgraph, csr_array
+
+
+def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) float64 and (F, 3) int32 copies of a mesh.
+
+    Raises `ValueError` for wrong shapes, a corner that is no vertex, and a vertex that no triangle uses.
+    """
+    vertices, faces = np.array(vertices, np.float64), np.array(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        raise ValueError(f"vertices: expected finite (N, 3), got {vertices.shape}")
+    if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
+        raise ValueError(f"faces: expected integers (F, 3), got {faces.dtype} {faces.shape}")
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces: expected corners in 0..{len(vertices) - 1}, got another index or no face")
+    unused = np.setdiff1d(np.arange(len(vertices)), faces)
+    if len(unused):
+        raise ValueError(f"expected every vertex in a triangle, got {len(unused)} loose, first {unused[0]}")
+    return vertices, faces.astype(np.int32)
+
+
+def edges(faces: np.ndarray) -> np.ndarray:
+    """Undirected edges (E, 2), smaller index first, each once, sorted."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(pairs, axis=0)
+
+
+def rings(faces: np.ndarray, count: int) -> list[list[int]]:
+    """The neighbours of each of `count` vertices in counter-clockwise order, read as a cycle.
+
+    A boundary vertex's open fan starts at its clockwise end, so that reading it as a cycle jumps across the boundary
+    and walks on from the other side. Several fans at one vertex follow one another.
+    """
+    following = [{} for _ in range(count)]
+    for a, b, c in faces.tolist():
+        for corner, first, second in ((a, b, c), (b, c, a), (c, a, b)):
+            turns = following[corner]
+            if turns.get(first) is None:  # a third triangle on an edge may not unlink the first two
+                turns[first] = second
+            turns.setdefault(second, None)
+    return [_chain(turns) for turns in following]
+
+
+def _chain(following: dict[int, int | None]) -> list[int]:
+    """All keys of {neighbour: next neighbour}, each run from its start; a closed run starts at its smallest key."""
+    starts = sorted(following.keys() - set(following.values())) + sorted(following)
+    ordered = {}
+    for vertex in starts:
+        while vertex is not None and vertex not in ordered:
+            ordered[vertex] = True
+            vertex = following[vertex]
+    return list(ordered)
+
+
+def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shortest paths along edges from the nearest source: distances (N,) and predecessors (N,).
+
+    Where no path leads, the distance is inf; sources and unreachable vertices have predecessor -1.
+    """
+    pairs = edges(faces)
+    lengths = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    # A zero-length edge would be no edge to scipy.
+    lengths = np.maximum(lengths, np.finfo(np.float64).tiny)
+    graph = csr_array((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(vertices),) * 2)
+    distance, predecessor, _ = csgraph.dijkstra(
+        graph, directed=False, indices=np.atleast_1d(sources), return_predecessors=True, min_only=True
+    )
+    return distance, np.maximum(predecessor, -1)
+
+
+def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """Distance (N,) along edges to the nearest of the source vertices, in the vertices' unit; inf if unreachable."""
+    return paths(np.asarray(vertices, np.float64), faces, sources)[0]

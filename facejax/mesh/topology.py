@@ -1,0 +1,145 @@
+"""The hierarchy that a mesh decoder climbs: coarser meshes, the way back up, and spirals, built once per template.
+
+Levels run from fine (0, the template itself) to coarse. Every coarse vertex is one of the template's. All tables are
+numpy arrays, so that a hierarchy is a plain pytree: pass it to jitted functions as an argument, since tables that are
+closed over become constants that XLA spends seconds folding.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from facejax.mesh import decimation, graph, spirals
+
+FORMAT = 1  # raise it when the same template and options give other tables
+FACTORS = (4.0, 4.0, 4.0, 4.0)
+# Fine to coarse, as in the published sparse-to-dense decoder (Otberdout et al. 2023).
+LENGTHS = (15, 14, 9, 9)
+
+
+class Hierarchy(NamedTuple):
+    """Levels 0..n of a template with N_0 = N vertices; every tuple runs from fine to coarse."""
+
+    kept: tuple[np.ndarray, ...]  # n + 1 of (N_i,) int32: the level's vertices, as indices into the template
+    faces: tuple[np.ndarray, ...]  # n + 1 of (F_i, 3) int32
+    spirals: tuple[np.ndarray, ...]  # n of (N_i, S_i) int32; N_i marks the dummy vertex, which reads zero
+    corners: tuple[np.ndarray, ...]  # n of (N_i, 3) int32: vertices of level i + 1 under each vertex of level i
+    weights: tuple[np.ndarray, ...]  # n of (N_i, 3) float32: their barycentric weights, >= 0, sum 1
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of vertices of each level."""
+        return tuple(len(kept) for kept in self.kept)
+
+
+def build(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    factors: Sequence[float] = FACTORS,
+    lengths: Sequence[int | None] | int | None = LENGTHS,
+    reference: int | None = None,
+    dilation: int = 1,
+    cache: str | os.PathLike | None = None,
+) -> Hierarchy:
+    """The hierarchy of a template (N, 3) with triangles (F, 3).
+
+    `factors` divide the number of vertices from level to level. `lengths` are the spiral lengths, one for all levels or
+    one per level but the coarsest; None takes int(mean + 2 std) of the two-ring sizes. `reference` is the vertex that
+    spirals start towards, by default the one with the largest z: the tip of the nose, in this project's frame. With a
+    folder `cache` the result is kept under the hash of everything that it depends on.
+
+    Raises `ValueError` for a broken mesh, options out of range, or a mesh too small for the factors.
+    """
+    vertices, faces = graph.check(vertices, faces)
+    if not isinstance(lengths, Sequence):
+        lengths = [lengths] * len(factors)
+    if len(factors) == 0 or len(lengths) != len(factors):
+        raise ValueError(f"expected one length per factor, got {len(lengths)} and {len(factors)}")
+    reference = int(np.argmax(vertices[:, 2])) if reference is None else reference
+    options = (FORMAT, [float(factor) for factor in factors], list(lengths), reference, dilation)
+    path = None
+    if cache is not None:
+        digest = hashlib.sha256(repr((options, vertices.shape, faces.shape)).encode())
+        digest.update(vertices.tobytes() + faces.tobytes())
+        path = Path(cache) / f"hierarchy-{digest.hexdigest()[:20]}.npz"
+        if (found := _read(path)) is not None:
+            return found
+    hierarchy = _build(vertices, faces, factors, lengths, reference, dilation)
+    if path is not None:
+        _write(path, hierarchy)
+    return hierarchy
+
+
+def save(hierarchy: Hierarchy) -> dict[str, np.ndarray]:
+    """The tables by name (`spirals/0`), to be stored in any file of named arrays."""
+    return {f"{field}/{i}": t for field in hierarchy._fields for i, t in enumerate(getattr(hierarchy, field))}
+
+
+def load(arrays: Mapping[str, np.ndarray]) -> Hierarchy:
+    """The hierarchy that `save` described. Raises `ValueError` for missing tables or ones that do not fit."""
+    levels = sum(name.startswith("kept/") for name in arrays)
+    counts = (levels, levels, *[levels - 1] * 3)
+    names = [
+        [f"{field}/{i}" for i in range(n)] for field, n in zip(Hierarchy._fields, counts, strict=True)
+    ]
+    expected = {name for group in names for name in group}
+    if levels < 2 or expected != set(arrays):
+        wrong = sorted(expected ^ set(arrays)) or ["kept/0"]
+        raise ValueError(f"not the tables of a hierarchy: missing or unexpected {', '.join(wrong)}")
+    hierarchy = Hierarchy(*(tuple(np.asarray(arrays[name]) for name in group) for group in names))
+    sizes = hierarchy.sizes
+    for i in range(levels - 1):
+        shapes = (hierarchy.spirals[i].shape[:1], hierarchy.corners[i].shape, hierarchy.weights[i].shape)
+        if shapes != ((sizes[i],), (sizes[i], 3), (sizes[i], 3)):
+            raise ValueError(f"level {i}: expected tables for {sizes[i]} vertices, got shapes {shapes}")
+        if hierarchy.spirals[i].max() > sizes[i] or hierarchy.corners[i].max() >= sizes[i + 1]:
+            raise ValueError(f"level {i}: a table points past the last vertex")
+    return hierarchy
+
+
+def _build(vertices, faces, factors, lengths, reference, dilation) -> Hierarchy:
+    kept, triangles, tables, corners, weights = [np.arange(len(vertices), dtype=np.int32)], [faces], [], [], []
+    origin = vertices[reference]
+    for factor, length in zip(factors, lengths, strict=True):
+        nearest = int(np.argmin(np.linalg.norm(vertices - origin, axis=1)))
+        tables.append(spirals.build(vertices, faces, reference=nearest, length=length, dilation=dilation))
+        chosen, coarse, _ = decimation.decimate(vertices, faces, factor)
+        corner, weight = decimation.upsampling(vertices, vertices[chosen], coarse)
+        corners.append(corner)
+        weights.append(weight)
+        vertices, faces = vertices[chosen], coarse
+        kept.append(kept[-1][chosen])
+        triangles.append(faces)
+    return Hierarchy(*map(tuple, (kept, triangles, tables, corners, weights)))
+
+
+def _read(path: Path) -> Hierarchy | None:
+    """A cached hierarchy; None where there is none or the file is damaged, so that it is built anew."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return load(dict(arrays))
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, hierarchy: Hierarchy) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the target, because a rename is atomic only within one file system.
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **save(hierarchy))
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise

@@ -1,0 +1,179 @@
+"""Inference composed: labels and a neutral face in, landmarks and meshes out.
+
+    models = pipeline.load()
+    landmarks = pipeline.landmarks(models, key, ["neutral", "high_smile", "neutral"], neutral)
+    vertices = pipeline.meshes(models, landmarks, neutral)
+
+Millimetres. A neutral face is (N, 3) vertices in the models' topology; T frames, L landmarks, S samples.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import os
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from facejax import weights
+from facejax.geometry import align, srvf
+from facejax.mesh import topology
+from facejax.models import decoder, motion
+
+RATE = 30.0  # frames per second of the motions that the generator learnt
+RELEASED = "makehuman4d.safetensors"
+
+
+class Face(NamedTuple):
+    """The topology that the models were trained on."""
+
+    vertices: np.ndarray  # (N, 3) a neutral face to start from: the average of the population
+    faces: np.ndarray  # (F, 3) triangles
+    landmark_index: np.ndarray  # (L,) vertices
+    source_index: np.ndarray  # (N,) vertices of MakeHuman's body, or empty: another topology
+    mask: np.ndarray  # (N,) bool, the face region
+
+
+class Models(NamedTuple):
+    """Everything that inference needs."""
+
+    labels: tuple[str, ...]  # neutral first
+    face: Face
+    peaks: jax.Array  # (labels, L, 3) mean peak displacement, unitless: where a motion starts when nobody knows
+    motion: motion.Params
+    hierarchy: Any
+    decoder: Any
+    about: dict[str, Any]  # how the weights were made
+
+
+def load(path: str | os.PathLike | None = None) -> Models:
+    """The released models, or those of a file. Raises `weights.WeightsError`."""
+    path = path or resources.files("facejax.assets").joinpath(RELEASED)
+    about = weights.load_metadata(path)
+    try:
+        like = _structure(about["shapes"])
+    except (KeyError, TypeError) as error:
+        raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
+    tree, about = weights.load(path, like)
+    tree = jax.tree.map(jnp.asarray, tree) | {"face": Face(*tree["face"])}
+    return Models(labels=tuple(about["labels"]), about=about, **tree)
+
+
+def save(path: str | os.PathLike, models: Models) -> None:
+    """Write models to one safetensors file; `about` gains what `load` needs."""
+    tree = models._asdict()
+    about = tree.pop("about") | {"labels": list(tree.pop("labels"))}
+    leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
+    weights.save(path, tree, metadata=about | {"shapes": leaves})
+
+
+def landmarks(
+    models: Models,
+    key: jax.Array,
+    labels: Sequence[str],
+    neutral: np.ndarray | jax.Array,
+    *,
+    samples: int | None = None,
+    frames: int = 30,
+    intensity: float = 1.0,
+) -> jax.Array:
+    """Landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`.
+
+    `frames` is the length of one transition; T = 1 + (frames - 1) x transitions, joints not repeated. A motion that
+    does not start at neutral starts at its label's mean peak, scaled to the face. `intensity` scales all displacements
+    from neutral. Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
+    """
+    indices = label_indices(models, labels)
+    if len(indices) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+    if frames < 2 or (samples is not None and samples < 1):
+        raise ValueError(f"frames must be 2 or more and samples 1 or more, got {frames} and {samples}")
+    if not 0 <= intensity <= 2:
+        raise ValueError(f"intensity must lie in 0..2, got {intensity}")
+    rest = neutral_landmarks(models, neutral)
+    keys = jax.random.split(key, samples or 1)
+    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
+    unitless = _compose(models.motion, models.peaks, keys, pairs, frames=frames)
+    scale = jnp.linalg.norm(rest - rest.mean(axis=0))
+    moved = rest + intensity * scale * unitless
+    return moved if samples is not None else moved[0]
+
+
+def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array) -> jax.Array:
+    """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3)."""
+    rest = neutral_landmarks(models, neutral)
+    if landmarks.shape[-2:] != rest.shape:
+        raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
+    return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
+
+
+def captions(labels: Sequence[str], *, frames: int = 30) -> tuple[tuple[int, str], ...]:
+    """(first frame, "neutral → high_smile") of each transition."""
+    pairs = zip(labels[:-1], labels[1:], strict=True)
+    return tuple((i * (frames - 1), f"{start} → {end}") for i, (start, end) in enumerate(pairs))
+
+
+def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Array:
+    """The landmarks (L, 3) of a neutral face (N, 3). Raises `ValueError` for another vertex count."""
+    expected = models.face.vertices.shape
+    if np.shape(neutral) != expected:
+        raise ValueError(f"neutral: expected vertices {expected} in the models' topology, got {np.shape(neutral)}")
+    return jnp.asarray(neutral, jnp.float32)[models.face.landmark_index]
+
+
+def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
+    """Indices of label names. Raises `ValueError` with the nearest names for an unknown one."""
+    for name in labels:
+        if name not in models.labels:
+            near = difflib.get_close_matches(name, models.labels, n=3, cutoff=0.4)
+            hint = f"did you mean {', '.join(near)}?" if near else f"there are {', '.join(models.labels)}"
+            raise ValueError(f"unknown label {name!r}: {hint}")
+    return np.array([models.labels.index(name) for name in labels], np.int32)
+
+
+@functools.partial(jax.jit, static_argnames="frames")
+def _compose(params, peaks, keys, pairs, *, frames):
+    """Unitless displacements from neutral (S, T, L, 3) through P transitions (P, 2)."""
+
+    def one(key):
+        def transition(displacement, inputs):
+            key, (start, end) = inputs
+            q, log_length = motion.sample(params, key, start, end)
+            curve = srvf.decode(q, log_length, displacement)
+            curve = _settle(curve, end)
+            if frames != curve.shape[0]:
+                curve = align.resample(curve, frames=frames)
+            return curve[-1], curve
+
+        inputs = (jax.random.split(key, len(pairs)), pairs)
+        _, curves = jax.lax.scan(transition, peaks[pairs[0, 0]], inputs)
+        rest = curves[:, 1:].reshape(-1, *curves.shape[2:])
+        return jnp.concatenate([curves[0, :1], rest])
+
+    return jax.vmap(one)(keys)
+
+
+def _settle(curve: jax.Array, end: jax.Array) -> jax.Array:
+    """Let a transition to neutral end there exactly.
+
+    The generator knows labels, not where the face stands, so what remains at the end is faded out along the way in
+    proportion to the path covered: no jump, and no motion where there was none.
+    """
+    steps = jnp.sqrt(jnp.sum(jnp.diff(curve, axis=0) ** 2, axis=(1, 2)))
+    covered = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)]) / jnp.maximum(jnp.sum(steps), 1e-12)
+    return curve - jnp.where(end == 0, 1.0, 0.0) * covered[:, None, None] * curve[-1]
+
+
+@jax.jit
+def _decode(params, hierarchy, displacements, neutral):
+    return neutral + decoder.apply(params, hierarchy, displacements)
+
+
+def _structure(shapes: dict[str, list]) -> dict[str, Any]:
+    """The tree to expect, rebuilt from the leaf names and shapes that the file states."""
+    raise RuntimeError

@@ -1,0 +1,23 @@
+"""Fixtures that several rooms share. Tiny sizes; one small dataset for the whole session."""
+
+import pytest
+
+from facejax.data import makehuman, makehuman4d
+
+
+@pytest.fixture(scope="session")
+def template():
+    """The MakeHuman head: 3,260 vertices."""
+    return makehuman.template()
+
+
+@pytest.fixture(scope="session")
+def tiny_spec():
+    """Six subjects: four train, one validates, one tests. Level 1, the cheapest that is not linear."""
+    return makehuman4d.Spec(level=1, subjects=6, meshes=60)
+
+
+@pytest.fixture(scope="session")
+def tiny_store(tiny_spec, tmp_path_factory):
+    """A small makehuman4d on disk."""
+    return makehuman4d.prepare(tiny_spec, folder=tmp_path_factory.mktemp("data"))

@@ -1,0 +1,72 @@
+"""Small scenes for the exporters, and Node for the tests that need a validator or a browser."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+# WebGL without a graphics card, and no talk with anybody's servers.
+FLAGS = "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --no-first-run "
+FLAGS += "--disable-quic --disable-background-networking --disable-component-update --disable-sync"
+ROOT = Path(__file__).parents[2]
+
+
+def _ball(subdivisions: int = 2, radius: float = 80.0) -> tuple[np.ndarray, np.ndarray]:
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32)
+
+
+@pytest.fixture
+def ball():
+    """A sphere: (N, 3) float32 mm, (F, 3) int32."""
+    return _ball()
+
+
+@pytest.fixture
+def moving():
+    """A sphere whose front grows a nose: (5, N, 3) float32, (F, 3); its back stands still, exactly."""
+    frames = 5
+    vertices, faces = _ball()
+    front = np.maximum(vertices[:, 2:] / 80, 0) ** 2
+    grow = np.linspace(0, 1, frames, dtype=np.float32)[:, None, None]
+    return vertices + grow * front * np.array([5, 3, 30], np.float32), faces
+
+
+@pytest.fixture
+def node():
+    """Runs a script of this folder under Node with a JSON argument; gives its JSON answer.
+
+    Packages are found as Node finds them: in `node_modules` at the repository's root, or in NODE_PATH.
+    """
+
+    def run(script: str, argument, *packages: str):
+        if shutil.which("node") is None:
+            pytest.skip("Node is not installed")
+        for package in packages:
+            found = subprocess.run(
+                ["node", "-e", f"require.resolve({package!r})"], cwd=ROOT, capture_output=True
+            )
+            if found.returncode:
+                pytest.skip(f"npm's {package} is not installed (npm install {package}, or set NODE_PATH)")
+        command = ["node", str(Path(__file__).parent / script), json.dumps(argument)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+@pytest.fixture
+def browser(node):
+    """As `node`, for scripts that drive Chromium; the argument gains its path."""
+    paths = [path for path in map(shutil.which, CHROMIUM) if path]
+    if not paths:
+        pytest.skip("Chromium is not installed")
+    return lambda script, argument, *packages: node(
+        script, {"chromium": paths[0], "flags": FLAGS.split(), **argument}, "playwright-core", *packages
+    )

@@ -1,0 +1,293 @@
+"""The motion GAN: exactly tangent output, unit motions, labels that matter, a toy distribution learned."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.test_util import check_grads
+
+from facejax import losses, steps, training
+from facejax.geometry import sphere
+from facejax.models import charts, motion, motion_reference
+
+CONFIG = motion.Config(steps=5, landmarks=4, labels=3, noise=6, rank=8, width=16, blocks=2, embedding=4)
+SHAPE = (5, 4, 3)
+
+
+def toy(count: int = 240, seed: int = 0):
+    """Motions of the six ordered pairs of 3 labels: means 0.4 apart, spread 0.1 to 0.2, two styles each."""
+    rng = np.random.default_rng(seed)
+    p = rng.standard_normal(SHAPE)
+    p /= np.sqrt(np.sum(p**2) / SHAPE[0])
+    modes = rng.standard_normal((4, *SHAPE))
+    pairs = np.array([(a, b) for a in range(3) for b in range(3) if a != b])
+    centres = 0.2 * rng.standard_normal((6, *SHAPE))
+    which = np.arange(count) % 6
+    z = rng.standard_normal((count, 4)) * [1, 0.7, 0.5, 0.3]
+    z[:, 0] = np.where(rng.random(count) < 0.5, -1.0, 1.0) + 0.2 * z[:, 0]
+    v = centres[which] + 0.1 * (1 + which % 2)[:, None, None, None] * np.einsum("nm,mtlc->ntlc", z, modes)
+    v = np.asarray(sphere.project(jnp.float32(p), jnp.float32(v)))
+    log_length = 0.3 * which + 0.1 * (1 + which % 2) * rng.standard_normal(count)
+    return p.astype(np.float32), v, log_length.astype(np.float32), *pairs[which].T
+
+
+@pytest.fixture(scope="module")
+def chart():
+    return charts.fit(*toy(), labels=3, rank=CONFIG.rank)
+
+
+@pytest.fixture(scope="module")
+def generator(chart):
+    params = motion.generator.init(jax.random.key(0), chart, config=CONFIG)
+    head = jax.random.normal(jax.random.key(5), params.weights["head"]["kernel"].shape) * 0.1
+    return params._replace(weights=params.weights | {"head": params.weights["head"] | {"kernel": head}})
+
+
+@pytest.fixture(scope="module")
+def critic(chart):
+    return motion.critic.init(jax.random.key(1), chart, config=CONFIG)
+
+
+def test_chart_directions_are_orthonormal_tangent_and_uncorrelated_within_pairs(chart):
+    p, tangents, log_length, start, end = toy()
+    basis = np.reshape(chart.basis, (CONFIG.rank, -1)).astype(np.float64)
+    np.testing.assert_allclose(basis @ basis.T, np.eye(CONFIG.rank), atol=2e-6)
+    np.testing.assert_allclose(basis @ p.ravel(), 0, atol=2e-6)
+    components = tangents.reshape(len(tangents), -1) @ basis.T
+    within = components.copy()
+    for a, b in {*zip(start.tolist(), end.tolist(), strict=True)}:
+        rows = (start == a) & (end == b)
+        np.testing.assert_allclose(chart.mean[a, b], components[rows].mean(0), atol=1e-5)
+        np.testing.assert_allclose(chart.length_mean[a, b], log_length[rows].mean(), rtol=1e-5, atol=1e-6)
+        within[rows] -= components[rows].mean(0)
+    covariance = within.T @ within / len(within)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[:4], chart.scale[:4], rtol=1e-3)
+    assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 1e-4 * covariance[0, 0]
+    assert np.all(np.diff(chart.scale) <= 0)
+
+
+def test_chart_spans_the_principal_directions_of_a_full_decomposition(chart):
+    tangents = toy()[1].reshape(240, -1)
+    values = np.linalg.svd(tangents.astype(np.float64), compute_uv=False) ** 2
+    best = values[CONFIG.rank :].sum() / values.sum()
+    assert best - 1e-6 <= float(chart.residual) <= best + 1e-3
+
+
+def test_a_pair_never_seen_gets_the_sum_of_its_labels_effects():
+    p, tangents, _, start, end = toy()
+    rng = np.random.default_rng(1)
+    effects = rng.standard_normal((2, 4))
+    start, end = np.arange(240) % 4, np.arange(240) // 4 % 4
+    seen = (start != 2) | (end != 1)
+    log_length = effects[0][start] + effects[1][end]
+    got = charts.fit(p, tangents[seen], log_length[seen], start[seen], end[seen], labels=4, rank=8)
+    np.testing.assert_allclose(got.length_mean[2, 1], effects[0][2] + effects[1][1], rtol=1e-5)
+
+
+def test_coordinates_and_motion_are_inverse_and_keep_distances(chart):
+    a, b = np.random.default_rng(0).standard_normal((2, CONFIG.rank + 1)).astype(np.float32)
+    (v, length), (w, _) = charts.motion(chart, a, 0, 1), charts.motion(chart, b, 0, 1)
+    np.testing.assert_allclose(charts.coordinates(chart, v, length, 0, 1), a, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(v - w), np.linalg.norm(a[1:] - b[1:]), rtol=1e-5)
+
+
+def test_chart_refuses_wrong_shapes_too_few_motions_and_nan():
+    p, tangents, *rest = toy()
+    with pytest.raises(ValueError, match=r"tangents must be \(M, T-1, L, 3\).*got \(240, 5, 3, 3\)"):
+        charts.fit(p, tangents[:, :, :3], *rest, labels=3, rank=8)
+    with pytest.raises(ValueError, match="rank 240 needs more than 240 motions; got 240"):
+        charts.fit(p, tangents, *rest, labels=3, rank=240)
+    tangents = tangents.copy()
+    tangents[17, 0, 0, 0] = np.nan
+    with pytest.raises(ValueError, match="motion 17 is not finite"):
+        charts.fit(p, tangents, *rest, labels=3, rank=8)
+
+
+def test_generator_is_the_plain_loop(generator):
+    noise = np.random.default_rng(0).standard_normal(CONFIG.noise)
+    chart, weights = jax.tree.map(np.float64, generator)
+    x = np.concatenate([noise, weights["labels"][0, 2], weights["labels"][1, 1]])
+    x = x @ weights["stem"]["kernel"] + weights["stem"]["bias"]
+    x = x / (1 + np.exp(-x))
+    for block in weights["blocks"]:
+        y = x @ block["kernel"] + block["bias"]
+        x = x + y / (1 + np.exp(-y)) / 2
+    deviation = x @ weights["head"]["kernel"]
+    deviation[: CONFIG.noise] += noise
+    tangent = np.zeros(SHAPE)
+    for r in range(CONFIG.rank):
+        tangent += (chart.mean[2, 1, r] + chart.scale[r] * deviation[r + 1]) * chart.basis[r]
+    got, length = motion.generator.apply(generator, jnp.float32(noise), 2, 1)
+    np.testing.assert_allclose(got, tangent, atol=1e-5)
+    np.testing.assert_allclose(length, chart.length_mean[2, 1] + chart.length_std * deviation[0], rtol=1e-5)
+
+
+def test_output_is_tangent_and_samples_have_unit_norm(generator):
+    keys = jax.random.split(jax.random.key(3), 50)
+    noise = 3.0 * jax.random.normal(jax.random.key(4), (50, CONFIG.noise))
+    tangent, _ = jax.vmap(motion.generator.apply, (None, 0, None, None))(generator, noise, 0, 2)
+    assert np.abs(sphere.inner(generator.chart.p, tangent)).max() < 1e-6
+    q, log_length = jax.vmap(motion.sample, (None, 0, None, None))(generator, keys, 1, 0)
+    assert q.shape == (50, *SHAPE) and log_length.shape == (50,)
+    np.testing.assert_allclose(sphere.norm(q), 1.0, atol=1e-5)
+    assert len(np.unique(np.asarray(log_length))) == 50
+
+
+def test_untrained_generator_has_the_right_means_and_the_average_spread(chart):
+    params = motion.generator.init(jax.random.key(0), chart, config=CONFIG)
+    noise = jax.random.normal(jax.random.key(1), (4000, CONFIG.noise))
+    got = jax.vmap(motion.generator.inner, (None, 0, None, None))(params, noise, 2, 0)
+    np.testing.assert_allclose(got[:, 1:].mean(0), chart.mean[2, 0], atol=0.06 * float(chart.scale[0]))
+    np.testing.assert_allclose(got[:, 1:5].std(0), chart.scale[:4], rtol=0.06)
+    np.testing.assert_allclose((got[:, 0].mean(), got[:, 0].std()), (0, 1), atol=0.06)
+
+
+def test_labels_matter_and_their_order_too(generator, critic):
+    noise = jnp.ones(CONFIG.noise)
+    outputs = [motion.generator.apply(generator, noise, a, b)[0] for a, b in [(0, 1), (1, 0), (0, 2)]]
+    scores = [motion.critic.apply(critic, outputs[0], 0.1, a, b) for a, b in [(0, 1), (1, 0), (0, 2)]]
+    assert min(np.abs(outputs[0] - outputs[1]).max(), np.abs(outputs[0] - outputs[2]).max()) > 1e-2
+    assert len({float(score) for score in scores}) == 3
+
+
+def test_eager_jit_and_vmap_agree(generator, critic):
+    noise = jax.random.normal(jax.random.key(2), (3, CONFIG.noise))
+    start, end = jnp.array([0, 1, 2]), jnp.array([1, 2, 0])
+    batch = jax.vmap(motion.generator.apply, (None, 0, 0, 0))(generator, noise, start, end)
+    scores = jax.vmap(motion.critic.apply, (None, 0, 0, 0, 0))(critic, *batch, start, end)
+    for i in range(3):
+        with jax.disable_jit():
+            one = motion.generator.apply(generator, noise[i], int(start[i]), int(end[i]))
+            score = motion.critic.apply(critic, *one, int(start[i]), int(end[i]))
+        np.testing.assert_allclose(batch[0][i], one[0], atol=1e-5)
+        np.testing.assert_allclose(batch[1][i], one[1], rtol=1e-5)
+        np.testing.assert_allclose(scores[i], score, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("network", ["generator", "critic"])
+def test_the_chart_has_no_gradient_and_every_weight_has_one(request, network):
+    params = constant = request.getfixturevalue(network)
+
+    def output(params):
+        noise = jnp.linspace(-1, 1, CONFIG.noise)
+        if network == "generator":
+            tangent, length = motion.generator.apply(params, noise, 0, 1)
+            return jnp.sum(jnp.square(tangent)) + jnp.square(length)
+        return motion.critic.apply(params, constant.chart.basis[0], jnp.float32(0.2), 0, 1)
+
+    slope = jax.grad(output)(params)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slope.chart))
+    assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(slope.weights))
+
+
+def test_gradients_equal_finite_differences(generator):
+    def energy(noise):
+        tangent, length = motion.generator.apply(generator, noise, 0, 1)
+        return jnp.sum(jnp.square(tangent)) + jnp.square(length)
+
+    check_grads(energy, (jnp.linspace(-1, 1, CONFIG.noise),), 1, eps=1e-2, rtol=1e-2)
+
+
+def test_critic_gradient_along_the_tangent_is_the_one_in_coordinates(critic):
+    v, w = critic.chart.basis[0] * 0.3, jnp.float32(0.2)
+    tangent = jax.grad(motion.critic.apply, 1)(critic, v, w, 0, 1)
+    inner = jax.grad(motion.critic.inner, 1)(critic, charts.coordinates(critic.chart, v, w, 0, 1), 0, 1)
+    np.testing.assert_allclose(np.linalg.norm(tangent), np.linalg.norm(inner[1:]), rtol=1e-5)
+
+
+def test_wrong_charts_and_noise_are_named(chart, generator):
+    with pytest.raises(
+        ValueError, match=r"basis must be \(128, 29, 68, 3\) for 19 labels; got \(8, 5, 4, 3\)"
+    ):
+        motion.generator.init(jax.random.key(0), chart)
+    with pytest.raises(ValueError, match=r"noise must have shape \(6,\); got \(7,\)"):
+        motion.generator.apply(generator, jnp.zeros(7), 0, 1)
+
+
+def full_chart(labels: int) -> charts.Chart:
+    f = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
+    return charts.Chart(
+        f(29, 68, 3), f(128, 29, 68, 3), f(128), f(labels, labels, 128), f(labels, labels), f(), f()
+    )
+
+
+def test_the_default_networks_count_under_two_million_numbers():
+    size = lambda tree: sum(leaf.size for leaf in jax.tree.leaves(tree))  # noqa: E731
+    chart, key = full_chart(19), jax.random.key(0)
+    generator = jax.eval_shape(motion.generator.init, key, chart)
+    critic = jax.eval_shape(motion.critic.init, key, chart)
+    assert size(generator) < 1.5e6
+    assert size(generator) + size(critic.weights) < 2e6
+
+
+def test_reference_sizes_are_the_published_ones():
+    config = motion_reference.Config(labels=18)
+    made = jax.eval_shape(
+        lambda k, c: motion_reference.generator.init(k, c, config=config), jax.random.key(0), full_chart(18)
+    )
+    stem = made.weights["stem"]
+    assert stem["kernel"].shape == (200, 51 * 7 * 1024)
+    assert stem["kernel"].size + stem["bias"].size == 73_479_168
+    assert [kernel.shape[:2] for kernel in made.weights["convs"]] == [(3, 3)] * 4
+    assert [kernel.shape[3] for kernel in made.weights["convs"]] == [512, 256, 128, 1]
+    assert motion_reference._sizes(204, 29) == [(51, 7), (102, 14), (204, 28), (204, 29)]
+
+
+def test_reference_networks_run_narrow_with_tangent_output(chart):
+    config = motion_reference.Config(steps=5, landmarks=4, labels=3, noise=6, width_divisor=16)
+    generator = motion_reference.generator.init(jax.random.key(0), chart, config=config)
+    critic = motion_reference.critic.init(jax.random.key(1), chart, config=config)
+    noise = jax.random.normal(jax.random.key(2), (4, 6))
+    tangent, length = jax.vmap(motion_reference.generator.apply, (None, 0, None, None))(
+        generator, noise, 0, 1
+    )
+    assert tangent.shape == (4, *SHAPE) and length.shape == (4,)
+    assert np.abs(sphere.inner(chart.p, tangent)).max() < 1e-6
+    scores = jax.vmap(motion_reference.critic.apply, (None, 0, 0, None, None))(critic, tangent, length, 0, 1)
+    assert len({*np.asarray(scores).tolist()}) == 4
+    other = motion_reference.critic.apply(critic, tangent[0], length[0], 1, 0)
+    assert float(other) != float(scores[0])
+    slope = jax.grad(lambda p: motion_reference.generator.apply(p, noise[0], 0, 1)[0].sum())(generator)
+    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slope.chart))
+
+
+@pytest.mark.slow
+def test_the_game_learns_spread_amplitude_and_both_styles():
+    """Half the pairs spread twice as much as the others; the untrained Gaussian gives all the average."""
+    config = CONFIG._replace(noise=16, width=96, embedding=8)
+    p, tangents, log_length, start, end = toy(3000)
+    chart = charts.fit(p, tangents, log_length, start, end, labels=3, rank=8)
+    real = jax.vmap(charts.coordinates, (None, 0, 0, 0, 0))(chart, tangents, log_length, start, end)
+    g, c = (n.init(k, chart, config=config).weights for n, k in zip(
+        (motion.generator, motion.critic), jax.random.split(jax.random.key(0)), strict=True))  # fmt: skip
+
+    def generate(weights, chart, key, pair):
+        return motion.generator.inner(motion.Params(chart, weights), jax.random.normal(key, (16,)), *pair)
+
+    def score(weights, chart, values, pair):
+        return motion.critic.inner(motion.Params(chart, weights), values, *pair)
+
+    adam = optax.adam(optax.cosine_decay_schedule(1e-3, 2000), b1=0.5, b2=0.9)
+    players = steps.Players(adam, optax.adam(1e-3, b1=0.5, b2=0.9))
+    step = training.gathered(steps.adversarial(generate, score, players, decay=0.99))
+    state = steps.start_adversarial(steps.Players(g, c), players, jax.random.key(1))
+    indices = training.epoch_indices(0, len(real), 5 * 64)(0, 2000)
+    held = ((real, (start, end)), chart)
+    state, _ = jax.jit(lambda s, i, h: jax.lax.scan(lambda s, b: step(s, b, h), s, i))(state, indices, held)
+    keys = jax.random.split(jax.random.key(2), 500)
+    for a, b in {*zip(start.tolist(), end.tolist(), strict=True)}:
+        fake = np.asarray(jax.vmap(generate, (None, None, 0, None))(state.extra, chart, keys, (a, b)))
+        true = np.asarray(real[(start == a) & (end == b)])
+        assert np.linalg.norm((fake - true).mean(0)[1:]) < 0.35 * np.linalg.norm(true.std(0)[1:])
+        assert 0.75 < np.linalg.norm(fake.std(0)[1:]) / np.linalg.norm(true.std(0)[1:]) < 1.25
+        assert 0.7 < fake[:, 0].std() / true[:, 0].std() < 1.3
+        assert abs(fake[:, 0].mean() - true[:, 0].mean()) < 0.35 * true[:, 0].std()
+
+
+def test_tangent_distance_of_the_loss_is_that_of_the_motions(chart):
+    """Equation 6 in coordinates expanded through the basis equals the one on log-mapped motions."""
+    a, b = np.random.default_rng(3).standard_normal((2, CONFIG.rank + 1)).astype(np.float32) * 0.1
+    v, w = charts.motion(chart, a, 0, 1)[0], charts.motion(chart, b, 0, 1)[0]
+    mapped = [sphere.log(chart.p, sphere.exp(chart.p, x)) for x in (v, w)]
+    np.testing.assert_allclose(losses.tangent_l1(v, w), losses.tangent_l1(*mapped), rtol=1e-4)

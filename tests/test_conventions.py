@@ -1,0 +1,275 @@
+"""Conventions, tested: how geometry functions behave under JAX's transformations, and which way imports point."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from facejax.geometry import align, sphere, srvf
+
+ROOT = Path(__file__).resolve().parents[1]
+T, L, K = 6, 4, 3
+
+
+def array(seed, *shape):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+
+
+def point(lead, seed):
+    raw = array(seed, *lead, T - 1, L, 3)
+    return raw / sphere.norm(raw)[..., None, None, None]
+
+
+def tangent(lead, seed):
+    return sphere.project(point(lead, 1), array(seed, *lead, T - 1, L, 3))
+
+
+def cluster(lead):
+    """Points near one another, where the Karcher mean is unique."""
+    raw = point(lead, 1)[..., None, :, :, :] + 0.5 * point((*lead, K), 2)
+    return raw / sphere.norm(raw)[..., None, None, None]
+
+
+def curve(lead, seed=1):
+    return array(seed, *lead, T, L, 3)
+
+
+def similarity(lead):
+    return align.procrustes(array(1, *lead, L, 3), array(2, *lead, L, 3), scaling=True)
+
+
+# Every public function of the room: its arguments for a batch of the shape `lead`, and its static options.
+CASES = {
+    "sphere.root": (lambda lead: (array(1, *lead) ** 2,), {}),
+    "sphere.inner": (lambda lead: (point(lead, 1), point(lead, 2)), {}),
+    "sphere.norm": (lambda lead: (tangent(lead, 2),), {}),
+    "sphere.project": (lambda lead: (point(lead, 1), array(2, *lead, T - 1, L, 3)), {}),
+    "sphere.exp": (lambda lead: (point(lead, 1), tangent(lead, 2)), {}),
+    "sphere.log": (lambda lead: (point(lead, 1), point(lead, 2)), {}),
+    "sphere.distance": (lambda lead: (point(lead, 1), point(lead, 2)), {}),
+    "sphere.geodesic": (lambda lead: (point(lead, 1), point(lead, 2), array(3, *lead)), {}),
+    "sphere.transport": (lambda lead: (point(lead, 1), point(lead, 2), tangent(lead, 3)), {}),
+    "sphere.extrinsic_mean": (lambda lead: (cluster(lead),), {}),
+    "sphere.karcher_mean": (lambda lead: (cluster(lead),), {"steps": 30}),
+    "srvf.encode": (lambda lead: (curve(lead),), {}),
+    "srvf.decode": (lambda lead: (point(lead, 1), array(2, *lead), array(3, *lead, L, 3)), {}),
+    "srvf.displacement": (lambda lead: (point(lead, 1), array(2, *lead)), {}),
+    "srvf.length": (lambda lead: (curve(lead),), {}),
+    "align.centre": (lambda lead: (array(1, *lead, L, 3),), {}),
+    "align.normalise": (lambda lead: (curve(lead), array(2, *lead, L, 3)), {}),
+    "align.denormalise": (lambda lead: (curve(lead), array(2, *lead) ** 2, array(3, *lead, 3)), {}),
+    "align.procrustes": (lambda lead: (array(1, *lead, L, 3), array(2, *lead, L, 3)), {"scaling": True}),
+    "align.apply": (lambda lead: (similarity(lead), array(3, *lead, L, 3)), {}),
+    "align.resample": (lambda lead: (curve(lead),), {"frames": 9, "by": "arc"}),
+    "align.interpolate": (lambda lead: (curve(lead), 2 * array(2, *lead, 7) ** 2), {}),
+}
+MODULES = {"sphere": sphere, "srvf": srvf, "align": align}
+
+
+def function(name):
+    module, short = name.split(".")
+    return getattr(MODULES[module], short)
+
+
+def assert_close(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=3e-6)
+
+
+def test_every_public_geometry_function_is_listed_and_jitted():
+    public = {
+        f"{room}.{name}"
+        for room, module in MODULES.items()
+        for name, value in vars(module).items()
+        if callable(value) and getattr(value, "__module__", "") == module.__name__
+        if not name.startswith("_") and not inspect.isclass(value)
+    }
+    assert public == set(CASES)
+    for name in public:
+        assert hasattr(function(name), "lower"), f"{name} is not jitted"
+        assert function(name).__doc__, f"{name} has no docstring"
+
+
+@pytest.mark.parametrize("lead", [(), (1,), (3, 2)], ids=str)
+@pytest.mark.parametrize("name", CASES)
+def test_eager_jit_and_vmap_agree(name, lead):
+    build, options = CASES[name]
+    args = build(lead)
+    batched = function(name)(*args, **options)
+    with jax.disable_jit():
+        assert_close(function(name)(*args, **options), batched)
+    mapped = jax.tree_util.Partial(function(name), **options)
+    for _ in lead:
+        mapped = jax.vmap(mapped)
+    assert_close(mapped(*args), batched)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_calls_of_one_shape_trace_once(name):
+    build, options = CASES[name]
+    args = build(())
+    function(name).clear_cache()
+    function(name)(*args, **options)
+    function(name)(*jax.tree.map(lambda x: 0.5 * x, args), **options)
+    assert function(name)._cache_size() == 1
+
+
+# What each room of facejax may import besides itself. A room that is not listed may import any of these, and no
+# listed room may import it, so that a new module is checked from its first day.
+BELOW = {
+    "geometry": set(),
+    "checkpoints": set(),
+    "weights": set(),
+    "mesh": {"geometry"},
+    "losses": {"geometry"},
+    "augment": {"geometry"},
+    "metrics": {"geometry"},
+    "training": {"checkpoints", "weights"},
+    "models": {"geometry", "mesh"},
+    "io": {"geometry", "mesh"},
+    "data": {"geometry", "mesh", "io", "augment"},
+}
+TOP = {"pipeline", "cli", "__main__"}
+
+
+def imports(path, module):
+    """The dotted names that a file imports, relative ones resolved, those inside functions included."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parents = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parents, base]).rstrip(".")
+            yield from ((f"{base}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def module_name(root, path):
+    parts = path.relative_to(root).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def violations(root):
+    """Every import under `root` that points the wrong way, as `module:line imports name`."""
+    found = []
+    for top in ("facejax", "experiments", "benchmarks"):
+        for path in sorted((root / top).rglob("*.py")):
+            module = module_name(root, path)
+            found += [
+                f"{module}:{line} imports {name}"
+                for name, line in imports(path, module)
+                if not allowed(module.split("."), name.split("."))
+            ]
+    return found
+
+
+def allowed(source, target):
+    if target[0] not in ("facejax", "experiments", "benchmarks", "tests"):
+        return True
+    if source[0] != "facejax":
+        shared = target[0] == source[0] and (target[1:] == [] or target[1].startswith("_"))
+        return target[0] == "facejax" or shared or target == source
+    if target[0] != "facejax":
+        return False
+    if len(source) == 1 or len(target) == 1 or source[1] == target[1]:
+        return True
+    if source[1] in BELOW:
+        return target[1] in BELOW[source[1]] or target[1].startswith("__")
+    return target[1] not in TOP or source[1] in TOP
+
+
+def graph(root):
+    """Module -> the modules of the package that it imports."""
+    paths = {module_name(root, path): path for path in sorted((root / "facejax").rglob("*.py"))}
+    edges = {}
+    for module, path in paths.items():
+        names = {name for name, _ in imports(path, module)}
+        # `from package import name` names a module, or something inside the package's __init__.
+        names = {name if name in paths else name.rpartition(".")[0] for name in names}
+        edges[module] = sorted(name for name in names if name in paths and name != module)
+    return edges
+
+
+def cycle(edges):
+    """One cycle of a graph as a list of nodes, or None."""
+    state = {}
+
+    def visit(node, trail):
+        state[node] = "open"
+        for after in edges[node]:
+            if state.get(after) == "open":
+                return [*trail[trail.index(after) :], after]
+            if after not in state and (found := visit(after, [*trail, after])):
+                return found
+        state[node] = "done"
+        return None
+
+    for node in edges:
+        if node not in state and (found := visit(node, [node])):
+            return found
+    return None
+
+
+def test_imports_point_one_way():
+    assert violations(ROOT) == []
+
+
+def test_no_module_imports_itself_in_a_circle():
+    # A package's own __init__ names its modules, and they never name it back.
+    edges = graph(ROOT)
+    assert "facejax.geometry.sphere" in edges["facejax.geometry.srvf"]
+    assert cycle(edges) is None
+
+
+def test_jaxopt_is_imported_by_one_module_at_most():
+    users = [
+        path
+        for path in sorted((ROOT / "facejax").rglob("*.py"))
+        if any(name.split(".")[0] == "jaxopt" for name, _ in imports(path, module_name(ROOT, path)))
+    ]
+    assert len(users) <= 1, users
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "wrong"),
+    [
+        ("facejax/geometry/new.py", "from facejax.mesh import ops", True),
+        ("facejax/geometry/new.py", "from ..models import decoder", True),
+        ("facejax/geometry/new.py", "def f():\n    import facejax.io", True),
+        ("facejax/geometry/new.py", "from . import sphere", False),
+        ("facejax/geometry/new.py", "from .. import pipeline", True),
+        ("facejax/training.py", "from facejax.models import motion", True),
+        ("facejax/io/save.py", "from facejax.data import cache", True),
+        ("facejax/data/new.py", "from facejax.io import meshes", False),
+        ("facejax/models/new.py", "from facejax import newcomer", True),
+        ("facejax/newcomer.py", "from facejax.models import motion", False),
+        ("facejax/newcomer.py", "from facejax import pipeline", True),
+        ("facejax/pipeline.py", "from facejax import newcomer", False),
+        ("facejax/cli.py", "from facejax import pipeline", False),
+        ("facejax/newcomer.py", "import experiments.pretrain", True),
+        ("facejax/newcomer.py", "import tests", True),
+        ("experiments/one.py", "from experiments import two", True),
+        ("experiments/one.py", "from experiments import _run", False),
+        ("experiments/one.py", "from facejax import cli", False),
+        ("benchmarks/one.py", "from experiments import _run", True),
+    ],
+)
+def test_the_check_finds_what_points_the_wrong_way(tmp_path, file, line, wrong):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(line + "\n")
+    assert bool(violations(tmp_path)) == wrong
+
+
+def test_the_check_finds_a_circle(tmp_path):
+    (tmp_path / "facejax").mkdir()
+    for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
+        (tmp_path / "facejax" / f"{name}.py").write_text(f"from facejax import {other}\n")
+    assert cycle(graph(tmp_path)) == ["facejax.a", "facejax.b", "facejax.c", "facejax.a"]
