@@ -23,6 +23,7 @@ import jax
 import numpy as np
 import tyro
 
+from facejax import files
 from facejax.data import cache
 
 RESULTS = Path(__file__).parent / "results"
@@ -85,7 +86,7 @@ def finish(
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
         write_text(RESULTS / f"{name}.md", body)
         if figure is not None:
-            with cache.atomic_path(RESULTS / f"{name}{figure.suffix}") as temporary:
+            with files.replacing(RESULTS / f"{name}{figure.suffix}") as temporary:
                 temporary.write_bytes(figure.read_bytes())
 
 
@@ -101,7 +102,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file as a whole or not at all."""
-    with cache.atomic_path(path) as temporary:
+    with files.replacing(path) as temporary:
         temporary.write_text(text)
 
 

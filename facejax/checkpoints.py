@@ -52,9 +52,10 @@ class Checkpoints:
         return sorted(self._manager.all_steps())
 
     def save(self, step: int, state: Tree) -> None:
-        """Write `state` (arrays, typed keys among them) as `step`, in the background; a step already there stays.
+        """Write `state` (arrays, typed keys among them) as `step`, in the background.
 
-        The arrays are copied before this returns, so the caller may donate or overwrite them at once.
+        The arrays are copied before this returns, so the caller may donate or overwrite them at once. A
+        step that is already there stays as it is.
         """
         if step in self._manager.all_steps():
             return
@@ -62,9 +63,11 @@ class Checkpoints:
         self._manager.save(step, args=ocp.args.StandardSave(jax.tree.map(jnp.copy, state)))
 
     def restore(self, like: Tree, *, step: int | None = None) -> Tree:
-        """Read a step (default: the newest); `like` gives tree, shapes, dtypes (arrays or `ShapeDtypeStruct`).
+        """Read a step (default: the newest).
 
-        Raises `CheckpointError` naming the folder and what is missing, unexpected, or of another shape or dtype.
+        `like` gives tree, shapes and dtypes (arrays or `ShapeDtypeStruct`).
+        Raises `CheckpointError` naming the folder and what is missing, unexpected, or of another shape or
+        dtype.
         """
         step = self.latest() if step is None else step
         if step not in self._manager.all_steps():

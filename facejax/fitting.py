@@ -29,7 +29,7 @@ class MotionPlan(NamedTuple):
     steps: int = 20_000
     batch: int = 128
     critic_steps: int = 4
-    rate: float = 3e-4  # decays to zero along a cosine
+    rate: float = 5e-4  # decays along a cosine, to 5 %
     penalty: float = 10.0
     reconstruction: float = 0.0  # alpha_2 of OT23 (10 there); see the README's table
     length: float = 0.0  # weight of |log-length error|, which goes with it
@@ -74,8 +74,12 @@ def fit_motion(
         motion.generator.init(generator_key, chart, config=config).weights,
         motion.critic.init(critic_key, chart, config=config).weights,
     )
-    schedule = optax.cosine_decay_schedule(plan.rate, plan.steps)
-    optimisers = steps.Players(optax.adam(schedule, 0.5, 0.9), optax.adam(plan.rate, 0.5, 0.9))
+    optimisers = steps.Players(
+        *(
+            optax.adam(optax.cosine_decay_schedule(plan.rate, plan.steps * count, alpha=0.05), 0.5, 0.9)
+            for count in (1, plan.critic_steps)
+        )
+    )
     step = steps.adversarial(
         lambda weights, chart, key, pair: motion.generator.inner(
             motion.Params(chart, weights), jax.random.normal(key, (config.noise,)), *pair

@@ -3,12 +3,13 @@
 import json
 import os
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from facejax import files
 
 _QUIET = 10.0  # seconds between two plain lines
 
@@ -17,8 +18,8 @@ class Journal:
     """Appends to `folder/metrics.jsonl` and shows progress; a context manager.
 
     Entries past step `done` are cut away first: a run that was killed wrote them after its last checkpoint.
-    On a terminal there is a bar, elsewhere a line now and then, both on standard error. `tensorboard` needs the
-    extra of that name.
+    On a terminal there is a bar, elsewhere a line now and then, both on standard error. `tensorboard` needs
+    the extra of that name.
     """
 
     def __init__(self, folder: str | os.PathLike, done: int, steps: int, *, tensorboard: bool = False):
@@ -82,11 +83,8 @@ def read(folder: str | os.PathLike) -> list[dict[str, float]]:
 
 def _truncate(path: Path, done: int) -> None:
     kept = [entry for entry in read(path.parent) if entry["step"] <= done]
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.writelines(json.dumps(entry) + "\n" for entry in kept)
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, path)
+    with files.replacing(path) as temporary:
+        temporary.write_text("".join(json.dumps(entry) + "\n" for entry in kept), encoding="utf-8")
 
 
 def _event_writer(folder: Path):

@@ -1,9 +1,9 @@
 """Losses of the two networks: Wasserstein with gradient penalty for motion, displacement L1 for meshes.
 
-Vocabulary: a *sample* is any pytree of arrays; a *condition* is what both players of the game are told about it
-(here: the two labels). `score(sample, condition)` judges ONE sample and returns a scalar. Mesh losses take
-displacements in millimetres with leading axes free; they sum over x, y, z, take the mean over the vertices and
-over the leading axes, so that a figure reads "millimetres (L1) per vertex".
+Vocabulary: a *sample* is any pytree of arrays; a *condition* is what both players of the game are told
+about it (here: the two labels). `score(sample, condition)` judges ONE sample and returns a scalar. Mesh
+losses take displacements in millimetres with leading axes free; they sum over x, y, z, take the mean over
+the vertices and over the leading axes, so that a figure reads "millimetres (L1) per vertex".
 
 Functions that take arrays are jitted; those that take a `score` are left to the caller's jit.
 """
@@ -25,10 +25,10 @@ def gradient_penalty(
 ) -> jax.Array:
     """Mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
 
-    `real`, `fake`: trees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all leaves; the
-    norm is the Euclidean one over all leaves together. Otberdout et al. 2023, last term of eq 2, and eq 5; the
-    condition goes into this term too, which eq 2 leaves out. Where the gradient vanishes the norm's derivative
-    is taken as 0.
+    `real`, `fake`: trees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all
+    leaves; the norm is the Euclidean one over all leaves together. Otberdout et al. 2023, last term of eq
+    2, and eq 5; the condition goes into this term too, which eq 2 leaves out. Where the gradient vanishes
+    the norm's derivative is taken as 0.
     """
     tau = jax.random.uniform(key, (jax.tree.leaves(real)[0].shape[0],))
 
@@ -115,10 +115,10 @@ def s2d(
 ) -> jax.Array:
     """The mesh decoder's loss on displacements (..., N, 3) in mm, with vertex weights (N,).
 
-    `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure the
-    same residual, so with weights of 1 this is (beta1 + beta2) times the first term alone.
-    `reference`: as the authors' program does it: the two factors swap places, and the weighted term is a sum
-    over the vertices, so that it outweighs the other some N times.
+    `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure
+    the same residual, so with weights of 1 this is (beta1 + beta2) times the first term alone. `reference`:
+    as the authors' program does it: the two factors swap places, and the weighted term is a sum over the
+    vertices, so that it outweighs the other some N times.
     """
     plain = displacement_l1(predicted, target)
     weighted = weighted_l1(predicted, target, weights)
@@ -137,12 +137,12 @@ def landmark_weights(
     mode: str = "linear",
     edge_length: float | None = None,
 ) -> jax.Array:
-    """Vertex weights (N,) in [0, 1], exactly 1 at the landmarks, falling with the distance d to the nearest one.
+    """Vertex weights (N,) in [0, 1]: 1 at the landmarks, falling with the distance d to the nearest one.
 
-    `vertices` (N, 3), `landmark_indices` (L,) of vertices.
-    `linear`: 1 - d / d_max, which the authors' published weights follow. `inverse`: the paper's 1 / d, held at
-    1 / edge_length nearer than that (it is infinite at the landmarks), then divided by its largest value; give
-    `edge_length` as the mean edge length of the mesh, in the unit of the vertices. `none`: 1 everywhere.
+    `vertices` (N, 3), `landmark_indices` (L,) of vertices. `linear`: 1 - d / d_max, which the authors'
+    published weights follow. `inverse`: the paper's 1 / d, held at 1 / edge_length nearer than that (it is
+    infinite at the landmarks), then divided by its largest value; give `edge_length` as the mean edge
+    length of the mesh, in the unit of the vertices. `none`: 1 everywhere.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise ValueError(f"vertices must have shape (N, 3); got {vertices.shape}")
@@ -153,7 +153,7 @@ def landmark_weights(
     offsets = vertices[:, None] - vertices[landmark_indices]
     distance = jnp.sqrt(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
     if mode == "linear":
-        return 1.0 - distance / jnp.max(distance)
+        return jnp.maximum(1.0 - distance / jnp.max(distance), 0.0)  # the farthest vertex may round below 0
     if edge_length is None:
         raise ValueError("mode 'inverse' needs edge_length, the mean edge length of the mesh")
     return edge_length / jnp.maximum(distance, edge_length)

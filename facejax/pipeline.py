@@ -22,8 +22,9 @@ import numpy as np
 
 from facejax import weights
 from facejax.geometry import align, srvf
+from facejax.io import dress
 from facejax.mesh import topology
-from facejax.models import decoder, motion
+from facejax.models import decoder, motion, starts
 
 RATE = 30.0  # frames per second of the motions that the generator learnt
 RELEASED = "makehuman4d.safetensors"
@@ -44,8 +45,9 @@ class Models(NamedTuple):
 
     labels: tuple[str, ...]  # neutral first
     face: Face
-    peaks: jax.Array  # (labels, L, 3) mean peak displacement, unitless: where a motion starts when nobody knows
+    props: dress.Props  # eyes and teeth of the template, for pictures; without landmarks: none
     motion: motion.Params
+    starts: starts.Params  # where a motion starts that does not start at neutral
     hierarchy: Any
     decoder: Any
     about: dict[str, Any]  # how the weights were made
@@ -85,23 +87,28 @@ def landmarks(
     """Landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`.
 
     `frames` is the length of one transition; T = 1 + (frames - 1) x transitions, joints not repeated. A motion that
-    does not start at neutral starts at its label's mean peak, scaled to the face. `intensity` scales all displacements
+    does not start at neutral starts at a peak drawn for it (`facejax.models.starts`), scaled to the face. `intensity` scales all displacements
     from neutral. Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
     """
-    indices = label_indices(models, labels)
-    if len(indices) < 2:
-        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
-    if frames < 2 or (samples is not None and samples < 1):
-        raise ValueError(f"frames must be 2 or more and samples 1 or more, got {frames} and {samples}")
     if not 0 <= intensity <= 2:
         raise ValueError(f"intensity must lie in 0..2, got {intensity}")
     rest = neutral_landmarks(models, neutral)
-    keys = jax.random.split(key, samples or 1)
-    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
-    unitless = _compose(models.motion, models.peaks, keys, pairs, frames=frames)
-    scale = jnp.linalg.norm(rest - rest.mean(axis=0))
-    moved = rest + intensity * scale * unitless
+    unitless = displacements(models, key, labels, samples=samples or 1, frames=frames)
+    moved = rest + intensity * jnp.linalg.norm(rest - rest.mean(axis=0)) * unitless
     return moved if samples is not None else moved[0]
+
+
+def displacements(
+    models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int = 30
+) -> jax.Array:
+    """Displacements from neutral (S, T, L, 3) through `labels`, unitless: divided by the face's landmark norm."""
+    indices = label_indices(models, labels)
+    if len(indices) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+    if frames < 2 or samples < 1:
+        raise ValueError(f"frames must be 2 or more and samples 1 or more, got {frames} and {samples}")
+    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
+    return _compose(models.motion, models.starts, jax.random.split(key, samples), pairs, frames=frames)
 
 
 def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array) -> jax.Array:
@@ -137,21 +144,25 @@ def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnames="frames")
-def _compose(params, peaks, keys, pairs, *, frames):
+def _compose(generator, beginnings, keys, pairs, *, frames):
     """Unitless displacements from neutral (S, T, L, 3) through P transitions (P, 2)."""
 
     def one(key):
+        start_key, motion_key = jax.random.split(key)
+        motion_keys = jax.random.split(motion_key, len(pairs))
+
         def transition(displacement, inputs):
             key, (start, end) = inputs
-            q, log_length = motion.sample(params, key, start, end)
-            curve = srvf.decode(q, log_length, displacement)
-            curve = _settle(curve, end)
+            curve = _settle(srvf.decode(*motion.sample(generator, key, start, end), displacement), end)
             if frames != curve.shape[0]:
                 curve = align.resample(curve, frames=frames)
             return curve[-1], curve
 
-        inputs = (jax.random.split(key, len(pairs)), pairs)
-        _, curves = jax.lax.scan(transition, peaks[pairs[0, 0]], inputs)
+        # The first start depends on the first motion, which is therefore drawn twice: it is the cheapest part.
+        origin = jnp.zeros_like(beginnings.mean[0])
+        travel = srvf.decode(*motion.sample(generator, motion_keys[0], *pairs[0]), origin)[-1]
+        begin = starts.sample(beginnings, start_key, travel, *pairs[0])
+        _, curves = jax.lax.scan(transition, begin, (motion_keys, pairs))
         rest = curves[:, 1:].reshape(-1, *curves.shape[2:])
         return jnp.concatenate([curves[0, :1], rest])
 

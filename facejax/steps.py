@@ -1,6 +1,7 @@
 """Training steps for `facejax.training.run`: down a loss, or one round of the adversarial game.
 
-Each maker takes functions and returns `step(state, batch, constants) -> (state, metrics)`; none knows a model.
+Each maker takes functions and returns `step(state, batch, constants) -> (state, metrics)`; none knows a
+model.
 """
 
 from collections.abc import Callable
@@ -51,13 +52,14 @@ def adversarial(
     terms: Callable | None = None,
     decay: float = 0.999,
 ) -> Step:
-    """A Wasserstein step with gradient penalty: `critic_steps` steps of the critic, then one of the generator.
+    """A Wasserstein step with gradient penalty: `critic_steps` of the critic, then one of the generator.
 
-    `generate(weights, constants, key, condition) -> sample` and `score(weights, constants, sample, condition)
-    -> scalar` handle ONE sample. A batch is (real samples, conditions) with a leading axis of critic_steps * B; each
-    critic step takes B of them, and the generator sees the last B. `terms(constants, fake, real, condition)` gives a
-    dict of weighted batch losses to add to the generator's. `extra` of the state is the exponential moving average of
-    the generator's weights: with a critic that never settles, the average is better than any single point.
+    `generate(weights, constants, key, condition) -> sample` and `score(weights, constants, sample,
+    condition) -> scalar` handle ONE sample. A batch is (real samples, conditions) with a leading axis of
+    critic_steps * B; each critic step takes B of them, and the generator sees the last B. `terms(constants,
+    fake, real, condition)` gives a dict of weighted batch losses to add to the generator's. `extra` of the
+    state is the exponential moving average of the generator's weights: with a critic that never settles,
+    the average is better than any single point.
     """
 
     def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:

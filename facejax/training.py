@@ -1,11 +1,12 @@
 """Training loops that know no model: functions in, state out, the same numbers after any interruption.
 
-Vocabulary: a *step* is a pure function `step(state, batch, constants) -> (state, metrics)`; metrics are a dict of
-scalars. `constants` hold what does not change (index tables, data on the device): passed as an argument, because
-arrays closed over would be folded into the program at compile time. A *chunk* is a number of steps scanned on the
-device in one call. `batches(first, count)` gives the data of `count` steps with leading axes (count, batch), and
-depends on nothing else; random keys are folded from the step index. So the state at a step is a function of that step
-alone, and a run that was killed and resumed cannot differ from one that was not.
+Vocabulary: a *step* is a pure function `step(state, batch, constants) -> (state, metrics)`; metrics are a
+dict of scalars. `constants` hold what does not change (index tables, data on the device): passed as an
+argument, because arrays closed over would be folded into the program at compile time. A *chunk* is a number
+of steps scanned on the device in one call. `batches(first, count)` gives the data of `count` steps with
+leading axes (count, batch), and depends on nothing else; random keys are folded from the step index. So the
+state at a step is a function of that step alone, and a run that was killed and resumed cannot differ from
+one that was not.
 """
 
 import os
@@ -45,10 +46,10 @@ class TrainingError(RuntimeError):
 
 
 def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.ndarray]:
-    """`indices(first, count)`: which of `size` samples the steps first ... first + count - 1 see, (count, batch) int32.
+    """`indices(first, count)`: which of `size` samples `count` steps see, (count, batch) int32.
 
-    Epoch after epoch in an order drawn from (seed, epoch), end to end: each sample comes once an epoch, none is
-    dropped, and a batch may reach over into the next epoch.
+    Epoch after epoch in an order drawn from (seed, epoch), end to end: each sample comes once an epoch,
+    none is dropped, and a batch may reach over into the next epoch.
     """
     if size < 1 or batch < 1:
         raise ValueError(f"size and batch must be at least 1; got {size} and {batch}")
@@ -67,7 +68,7 @@ def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.n
 
 
 def gathered(step: Step) -> Step:
-    """Let `step` take indices for a batch, and `(data, constants)` for constants: the data stay on the device."""
+    """Let `step` take indices as its batch and (data, constants) as constants: data stay on the device."""
     return lambda state, indices, held: step(
         state, jax.tree.map(lambda leaf: leaf[indices], held[0]), held[1]
     )
@@ -91,11 +92,12 @@ def run(
 ) -> TrainState:
     """Train until `steps` steps are done, counted from the very first start, and return the state.
 
-    Writes to `folder`: `metrics.jsonl` (one line a chunk: the means over its steps) and `checkpoints/` (every
-    `save_steps` steps or `save_seconds` seconds, whichever comes first, at the end of a chunk; the newest `keep`).
-    With `resume`, goes on from the newest checkpoint, if there is one, and cuts `metrics.jsonl` back to it.
-    SIGTERM and Ctrl-C save, then leave as usual (`SystemExit`, `KeyboardInterrupt`); a second one leaves at once.
-    Raises `TrainingError` on a metric that is not finite or beyond `limit`, with the step and its name.
+    Writes to `folder`: `metrics.jsonl` (one line a chunk: the means over its steps) and `checkpoints/`
+    (every `save_steps` steps or `save_seconds` seconds, whichever comes first, at the end of a chunk; the
+    newest `keep`). With `resume`, goes on from the newest checkpoint, if there is one, and cuts
+    `metrics.jsonl` back to it. SIGTERM and Ctrl-C save, then leave as usual (`SystemExit`,
+    `KeyboardInterrupt`); a second one leaves at once. Raises `TrainingError` on a metric that is not finite
+    or beyond `limit`, with the step and its name.
     """
     folder = Path(folder)
 
@@ -134,7 +136,7 @@ def run(
 
 
 def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int | None, folder: Path) -> None:
-    """Raise on the earliest bad value of a chunk; `metrics` (steps,) each, `first` the steps done before it."""
+    """Raise on the earliest bad value of a chunk: `metrics` (steps,) each, `first` steps done before it."""
     wrong = {name: ~(np.abs(values) <= limit) for name, values in metrics.items()}  # true for NaN too
     bad = [(int(np.argmax(where)), name) for name, where in wrong.items() if where.any()]
     if bad:

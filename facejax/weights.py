@@ -1,13 +1,13 @@
 """Released weights: one safetensors file per tree of arrays, with a description of where it came from.
 
 A file holds raw arrays and a JSON header, and no code. Leaves are named by their path in the tree, such as
-`weights/blocks/0/kernel`. Loading needs a tree of the expected shapes (`jax.eval_shape` of an `init` gives one for free)
-and checks names, shapes and dtypes against it, so that a file of another model or version never loads in part.
+`weights/blocks/0/kernel`. Loading needs a tree of the expected shapes (`jax.eval_shape` of an `init` gives
+one for free) and checks names, shapes and dtypes against it, so that a file of another model or version
+never loads in part.
 """
 
 import json
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ import jax
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as _serialise
+
+from facejax import files
 
 Tree = Any
 _HEADER = "facejax"
@@ -38,22 +40,13 @@ def names(tree: Tree) -> dict[str, Any]:
 
 
 def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
-    """Write a tree of arrays, and `metadata` (anything JSON can hold), to a file that is replaced as a whole."""
+    """Write a tree of arrays and `metadata` (anything JSON holds) to a file that is replaced as a whole."""
     path = Path(path)
     arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
     header = {_HEADER: json.dumps(metadata or {}, sort_keys=True)}
     data = _serialise(arrays, metadata=header)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the target, because a rename is atomic only within one file system.
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with files.replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:

@@ -69,7 +69,7 @@ def test_missing_truncated_and_foreign_files_are_named(tmp_path):
     from safetensors.numpy import save_file
 
     save_file({"a": np.zeros(1)}, tmp_path / "foreign")
-    with pytest.raises(weights.WeightsError, match="foreign.*lacks the 'facejax' entry"):
+    with pytest.raises(weights.WeightsError, match=r"foreign.*lacks the 'facejax' entry"):
         weights.load_metadata(tmp_path / "foreign")
 
 

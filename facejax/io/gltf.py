@@ -10,7 +10,8 @@ import struct
 
 import numpy as np
 
-from facejax.io import files, scene, shade
+from facejax import files
+from facejax.io import scene, shade
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTEX_DATA, _INDEX_DATA = 34962, 34963

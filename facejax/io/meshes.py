@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax.io import files, ply
+from facejax import files
+from facejax.io import ply
 
 LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
 _ARRAY_HEADERS = {
@@ -78,6 +79,31 @@ def read(path: str | os.PathLike) -> Mesh:
     except _DAMAGE as error:
         raise MeshError(f"{path}: {error}") from error
     return _checked(path, vertices, faces)
+
+
+def read_animation(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict]:
+    """Reads an NPZ of `vertices` (T, N, 3) or (N, 3) and `faces`; and what else it holds of `landmarks` and `fps`.
+
+    Raises:
+      MeshError: as `read`.
+    """
+    path = Path(path)
+    try:
+        arrays = _read_arrays(path, ("vertices", "faces", "landmarks", "fps"))
+    except FileNotFoundError:
+        raise MeshError(f"{path}: no such file") from None
+    except (OSError, *_DAMAGE) as error:
+        raise MeshError(f"{path}: {error}") from error
+    vertices, faces = arrays.pop("vertices"), arrays.pop("faces", None)
+    if faces is None:
+        raise MeshError(f"{path}: has no triangles, nothing to show")
+    if vertices.ndim not in (2, 3) or 0 in vertices.shape:
+        raise MeshError(f"{path}: vertices must be (T, N, 3) or (N, 3), got {vertices.shape}")
+    _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
+    extra = {"landmarks": arrays["landmarks"]} if "landmarks" in arrays else {}
+    if "fps" in arrays:
+        extra["fps"] = float(arrays["fps"].ravel()[0])
+    return vertices, faces.astype(np.int32), extra
 
 
 def write(path: str | os.PathLike, vertices, faces=None) -> None:
@@ -153,17 +179,21 @@ def _read_obj(path: Path):
 
 
 def _read_npz(path: Path):
+    arrays = _read_arrays(path, ("vertices", "faces"))
+    return arrays.get("vertices"), arrays.get("faces")
+
+
+def _read_arrays(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The wanted arrays that an NPZ holds; the first must be there."""
     with zipfile.ZipFile(path) as archive:
         names = set(archive.namelist())
-        if "vertices.npy" not in names:
-            raise ValueError(f"holds no array 'vertices', only {sorted(name[:-4] for name in names)}")
-        arrays = []
-        for name in ("vertices.npy", "faces.npy"):
-            if name not in names:
-                arrays.append(None)
-                continue
-            with archive.open(name) as stream:
-                arrays.append(_read_array(stream, archive.getinfo(name).file_size, name[:-4]))
+        if f"{wanted[0]}.npy" not in names:
+            raise ValueError(f"holds no array {wanted[0]!r}, only {sorted(name[:-4] for name in names)}")
+        arrays = {}
+        for name in wanted:
+            if f"{name}.npy" in names:
+                with archive.open(f"{name}.npy") as stream:
+                    arrays[name] = _read_array(stream, archive.getinfo(f"{name}.npy").file_size, name)
     return arrays
 
 

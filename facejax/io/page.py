@@ -15,7 +15,8 @@ from importlib import resources
 
 import numpy as np
 
-from facejax.io import files, props, render, scene, shade
+from facejax import files
+from facejax.io import props, render, scene, shade
 
 _ASPECT = (4, 5)
 

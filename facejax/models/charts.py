@@ -19,14 +19,15 @@ import numpy as np
 from facejax.geometry import sphere
 
 
+FEW = 8  # motions of a pair below which its own spread is not trusted
+
+
 class Chart(NamedTuple):
     """Constants from the training set, never trained; K labels, R directions."""
 
     p: jax.Array  # (T-1, L, 3), a point on the sphere
-    basis: (
-        jax.Array
-    )  # (R, T-1, L, 3), orthonormal in the Euclidean sense, orthogonal to p, widest spread first
-    scale: jax.Array  # (R,), standard deviation along each direction within a label pair
+    basis: jax.Array  # (R, T-1, L, 3), Euclidean orthonormal, orthogonal to p, widest spread first
+    scale: jax.Array  # (K, K, R), standard deviation along each direction within each (start, end)
     mean: jax.Array  # (K, K, R), mean components of each (start, end)
     length_mean: jax.Array  # (K, K), mean log-length of each (start, end)
     length_std: jax.Array  # (), standard deviation of the log-length within a label pair
@@ -45,8 +46,9 @@ def fit(
 ) -> Chart:
     """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), the others (M,).
 
-    The directions span the R principal ones of all tangent vectors, and are turned within that span so that the
-    spread within label pairs is uncorrelated. Pairs without a motion get the sum of a start's and an end's effect.
+    The directions span the R principal ones of all tangent vectors, and are turned within that span so that
+    the spread within label pairs is uncorrelated. Pairs without a motion get the sum of a start's and an
+    end's effect as mean; pairs with fewer than 8 the spread of all.
     """
     shape = p.shape
     if p.ndim != 3 or tangents.shape[1:] != shape:
@@ -66,7 +68,8 @@ def fit(
     within = components - mean[start, end]
     variance, turn = np.linalg.eigh(within.T @ within / len(within))
     variance, turn = variance[::-1], turn[:, ::-1]
-    scale = np.sqrt(np.maximum(variance, 1e-12 * variance[0]))
+    pooled = np.maximum(variance, 1e-12 * variance[0])
+    scale = _pair_spreads(within @ turn, pooled, start, end, labels)
     length_mean = _pair_means(log_length[:, None], start, end, labels)[..., 0]
     length_std = np.std(log_length - length_mean[start, end])
     outside = 1.0 - np.sum(components**2) / np.sum(np.square(flat, dtype=np.float64))
@@ -76,7 +79,7 @@ def fit(
 
 @jax.jit
 def coordinates(chart: Chart, tangent: jax.Array, log_length: jax.Array, start, end) -> jax.Array:
-    """Coordinates (R + 1,) of a tangent vector at p (T-1, L, 3) and a log-length (); the part off the basis is lost."""
+    """Coordinates (R + 1,) of a tangent at p (T-1, L, 3), less what the basis lacks, and a log-length ()."""
     standard = (log_length - chart.length_mean[start, end]) / chart.length_std
     return jnp.concatenate([standard[None], jnp.tensordot(chart.basis, tangent, 3)])
 
@@ -100,8 +103,24 @@ def _principal_directions(flat: np.ndarray, rank: int) -> np.ndarray:
     return (span @ turn[:, np.argsort(-values)[:rank]]).T
 
 
+def _pair_spreads(within: np.ndarray, pooled: np.ndarray, start, end, labels: int) -> np.ndarray:
+    """Standard deviations (K, K, R) of components (M, R) about their pair's mean; the pooled variance where few.
+
+    Pairs differ: along the direction that tells a mouth drawn left from one drawn right, only those with such a
+    mouth spread at all, and one spread for all would give the others a motion that they never make.
+    """
+    pair = np.asarray(start) * labels + np.asarray(end)
+    count = np.bincount(pair, minlength=labels**2)
+    total = np.zeros((labels**2, within.shape[1]))
+    np.add.at(total, pair, within**2)
+    # The mean was fitted too: one degree of freedom less.
+    own = total / np.maximum(count - 1, 1)[:, None]
+    variance = np.where(count[:, None] >= FEW, np.maximum(own, 1e-6 * pooled), pooled)
+    return np.sqrt(variance).reshape(labels, labels, -1)
+
+
 def _pair_means(values: np.ndarray, start: np.ndarray, end: np.ndarray, labels: int) -> np.ndarray:
-    """Mean of values (M, C) for each pair (K, K, C); absent pairs by least squares on start plus end effects."""
+    """Mean of values (M, C) for each pair (K, K, C); absent pairs by least squares on start + end effects."""
     pair = np.asarray(start) * labels + np.asarray(end)
     count = np.bincount(pair, minlength=labels**2)
     total = np.zeros((labels**2, values.shape[1]))

@@ -1,9 +1,10 @@
 """Motion3DGAN, sized for a CPU: noise and two labels in, a landmark motion on the SRVF sphere out.
 
-After Otberdout et al. 2023, 3.1, with an architecture of our own; theirs is `facejax.models.motion_reference`.
-A residual network turns noise and label embeddings into coordinates of the training set's tangent chart
-(`facejax.models.charts`). The linear output basis makes jitter impossible that the data do not have, and 5,916
-outputs cost no more to train than its R directions. The critic reads the same coordinates.
+After Otberdout et al. 2023, 3.1, with an architecture of our own; theirs is
+`facejax.models.motion_reference`. A residual network turns noise and label embeddings into coordinates of
+the training set's tangent chart (`facejax.models.charts`). The linear output basis makes jitter impossible
+that the data do not have, and 5,916 outputs cost no more to train than its R directions. The critic reads
+the same coordinates.
 
 Both networks handle one sample; the caller vmaps. `start`, `end` are label indices, 0 ... K - 1.
 """
@@ -23,7 +24,7 @@ Weights = dict[str, Any]
 
 
 class Config(NamedTuple):
-    """Sizes, all static; the generator and critic of the default together count 1.9 M numbers, chart included."""
+    """Sizes, all static; the default generator and critic count 1.9 M numbers, chart included."""
 
     steps: int = 29  # T - 1
     landmarks: int = 68
@@ -33,6 +34,9 @@ class Config(NamedTuple):
     width: int = 384
     blocks: int = 3
     embedding: int = 32
+
+
+DEFAULT = Config()
 
 
 class Params(NamedTuple):
@@ -50,8 +54,8 @@ class Network(NamedTuple):
     inner: Callable
 
 
-def _init_generator(key: jax.Array, chart: Chart, *, config: Config = Config()) -> Params:
-    """A generator that starts as a Gaussian: the right mean per pair, the average spread within pairs."""
+def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+    """A generator that starts as a Gaussian: the right mean and spread of every pair."""
     _check_chart(chart, config)
     stem_key, label_key, blocks_key = jax.random.split(key, 3)
     weights = {
@@ -73,7 +77,7 @@ def _generate_coordinates(params: Params, noise: jax.Array, start, end) -> jax.A
     hidden = jnp.concatenate([noise, weights["labels"][0, start], weights["labels"][1, end]])
     hidden = _residual_stack(weights, hidden, jax.nn.silu)
     deviation = noise @ weights["skip"] + _linear(weights["head"], hidden)
-    unit = jnp.append(1.0, chart.scale)
+    unit = jnp.append(1.0, chart.scale[start, end])
     centre = jnp.append(0.0, chart.mean[start, end])
     return centre + unit * deviation
 
@@ -86,7 +90,7 @@ def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, 
     )
 
 
-def _init_critic(key: jax.Array, chart: Chart, *, config: Config = Config()) -> Params:
+def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
     _check_chart(chart, config)
     stem_key, label_key, blocks_key, head_key = jax.random.split(key, 4)
     weights = {
@@ -104,7 +108,7 @@ def _score(params: Params, values: jax.Array, start, end) -> jax.Array:
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     # Centred per pair, and brought to order one by a single factor: a factor per direction would blow up the
     # gradient along the narrow ones, which the penalty then fights.
-    offset = (values[1:] - chart.mean[start, end]) / jnp.sqrt(jnp.mean(jnp.square(chart.scale)))
+    offset = (values[1:] - chart.mean[start, end]) / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
     hidden = jnp.concatenate([values[:1], offset, weights["labels"][0, start], weights["labels"][1, end]])
     return _linear(
         weights["head"], _residual_stack(weights, hidden, partial(jax.nn.leaky_relu, negative_slope=0.2))

@@ -1,9 +1,9 @@
 """Motion3DGAN as its authors' program builds it: the SRVF as an image, 3L rows by T-1 columns.
 
-The published description (Otberdout et al. 2023, 3.1) leaves the layers out; these are the ones of the authors' 2022
-program, with three changes: the last size is T-1 columns, the critic has no batch norm (which is unsound
-with a gradient penalty), and both networks know the log-length. The generator alone has 77 M weights at 19 labels;
-`width_divisor` makes all layers narrower.
+The published description (Otberdout et al. 2023, 3.1) leaves the layers out; these are the ones of the
+authors' 2022 program, with three changes: the last size is T-1 columns, the critic has no batch norm (which
+is unsound with a gradient penalty), and both networks know the log-length. The generator alone has 77 M
+weights at 19 labels; `width_divisor` makes all layers narrower.
 
 Same calls as `facejax.models.motion`: one sample, `start` and `end` label indices. Images are (rows, columns,
 channels); row 3 l + c is coordinate c of landmark l.
@@ -31,6 +31,9 @@ class Config(NamedTuple):
     width_divisor: int = 1
 
 
+DEFAULT = Config()
+
+
 class Params(NamedTuple):
     """One network: the chart, of which it uses the point p and the log-lengths, and its weights."""
 
@@ -45,7 +48,7 @@ class Network(NamedTuple):
     apply: Callable
 
 
-def _init_generator(key: jax.Array, chart: Chart, *, config: Config = Config()) -> Params:
+def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
     stem_key, length_key, *conv_keys = jax.random.split(key, 6)
     condition = 2 * config.labels
     widths = [width // config.width_divisor for width in (1024, 512, 256, 128)] + [1]
@@ -80,7 +83,7 @@ def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, 
     return tangent, chart.length_mean[start, end] + chart.length_std * standard
 
 
-def _init_critic(key: jax.Array, chart: Chart, *, config: Config = Config()) -> Params:
+def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
     *conv_keys, hidden_key, head_key = jax.random.split(key, 5)
     condition = 2 * config.labels
     widths = [width // config.width_divisor for width in (64, 32, 16)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from facejax.data import assets, cache
+from facejax.data import assets
 
 
 def test_head_is_one_manifold_with_four_holes():
@@ -74,26 +74,3 @@ def test_damaged_build_is_named(own_cache):
     (own_cache / f"makehuman-{assets.VERSION}-{assets.BUILD}.npz").write_bytes(b"PK damaged")
     with pytest.raises(assets.AssetError, match="delete it"):
         assets.load()
-
-
-def test_atomic_path_leaves_nothing_behind(tmp_path):
-    target = tmp_path / "a" / "file.txt"
-    with pytest.raises(RuntimeError), cache.atomic_path(target) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert list(target.parent.iterdir()) == []
-    with cache.atomic_path(target) as temporary:
-        temporary.write_text("whole")
-    assert target.read_text() == "whole" and len(list(target.parent.iterdir())) == 1
-
-
-def test_atomic_folder_replaces_or_vanishes(tmp_path):
-    target = tmp_path / "folder"
-    with pytest.raises(RuntimeError), cache.atomic_folder(target) as temporary:
-        (temporary / "x").write_text("half")
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-    for text in ("first", "second"):
-        with cache.atomic_folder(target) as temporary:
-            (temporary / "x").write_text(text)
-        assert (target / "x").read_text() == text

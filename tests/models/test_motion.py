@@ -51,7 +51,7 @@ def critic(chart):
 
 def test_chart_directions_are_orthonormal_tangent_and_uncorrelated_within_pairs(chart):
     p, tangents, log_length, start, end = toy()
-    basis = np.reshape(chart.basis, (CONFIG.rank, -1)).astype(np.float64)
+    basis = np.asarray(chart.basis, np.float64).reshape(CONFIG.rank, -1)
     np.testing.assert_allclose(basis @ basis.T, np.eye(CONFIG.rank), atol=2e-6)
     np.testing.assert_allclose(basis @ p.ravel(), 0, atol=2e-6)
     components = tangents.reshape(len(tangents), -1) @ basis.T
@@ -61,10 +61,11 @@ def test_chart_directions_are_orthonormal_tangent_and_uncorrelated_within_pairs(
         np.testing.assert_allclose(chart.mean[a, b], components[rows].mean(0), atol=1e-5)
         np.testing.assert_allclose(chart.length_mean[a, b], log_length[rows].mean(), rtol=1e-5, atol=1e-6)
         within[rows] -= components[rows].mean(0)
+        own = within[rows].std(0, ddof=1)
+        np.testing.assert_allclose(chart.scale[a, b][:4], own[:4], rtol=1e-3)
     covariance = within.T @ within / len(within)
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance))[:4], chart.scale[:4], rtol=1e-3)
     assert np.abs(covariance - np.diag(np.diag(covariance))).max() < 1e-4 * covariance[0, 0]
-    assert np.all(np.diff(chart.scale) <= 0)
+    assert np.all(np.diff(np.diag(covariance)) <= 1e-9)
 
 
 def test_chart_spans_the_principal_directions_of_a_full_decomposition(chart):
@@ -117,7 +118,7 @@ def test_generator_is_the_plain_loop(generator):
     deviation[: CONFIG.noise] += noise
     tangent = np.zeros(SHAPE)
     for r in range(CONFIG.rank):
-        tangent += (chart.mean[2, 1, r] + chart.scale[r] * deviation[r + 1]) * chart.basis[r]
+        tangent += (chart.mean[2, 1, r] + chart.scale[2, 1, r] * deviation[r + 1]) * chart.basis[r]
     got, length = motion.generator.apply(generator, jnp.float32(noise), 2, 1)
     np.testing.assert_allclose(got, tangent, atol=1e-5)
     np.testing.assert_allclose(length, chart.length_mean[2, 1] + chart.length_std * deviation[0], rtol=1e-5)
@@ -134,12 +135,12 @@ def test_output_is_tangent_and_samples_have_unit_norm(generator):
     assert len(np.unique(np.asarray(log_length))) == 50
 
 
-def test_untrained_generator_has_the_right_means_and_the_average_spread(chart):
+def test_untrained_generator_has_the_right_means_and_spreads(chart):
     params = motion.generator.init(jax.random.key(0), chart, config=CONFIG)
     noise = jax.random.normal(jax.random.key(1), (4000, CONFIG.noise))
     got = jax.vmap(motion.generator.inner, (None, 0, None, None))(params, noise, 2, 0)
-    np.testing.assert_allclose(got[:, 1:].mean(0), chart.mean[2, 0], atol=0.06 * float(chart.scale[0]))
-    np.testing.assert_allclose(got[:, 1:5].std(0), chart.scale[:4], rtol=0.06)
+    np.testing.assert_allclose(got[:, 1:].mean(0), chart.mean[2, 0], atol=0.06 * float(chart.scale[2, 0].max()))
+    np.testing.assert_allclose(got[:, 1:5].std(0), chart.scale[2, 0, :4], rtol=0.06)
     np.testing.assert_allclose((got[:, 0].mean(), got[:, 0].std()), (0, 1), atol=0.06)
 
 
@@ -236,8 +237,16 @@ def test_reference_sizes_are_the_published_ones():
 
 def test_reference_networks_run_narrow_with_tangent_output(chart):
     config = motion_reference.Config(steps=5, landmarks=4, labels=3, noise=6, width_divisor=16)
-    generator = motion_reference.generator.init(jax.random.key(0), chart, config=config)
-    critic = motion_reference.critic.init(jax.random.key(1), chart, config=config)
+    rng = np.random.default_rng(0)
+
+    def made(network):  # plain random weights of the right shapes spare the compilation of every initialiser
+        shapes = jax.eval_shape(
+            lambda key: network.init(key, chart, config=config), jax.random.key(0)
+        ).weights
+        fill = lambda leaf: 0.2 * rng.standard_normal(leaf.shape).astype(np.float32)  # noqa: E731
+        return motion_reference.Params(chart, jax.tree.map(fill, shapes))
+
+    generator, critic = made(motion_reference.generator), made(motion_reference.critic)
     noise = jax.random.normal(jax.random.key(2), (4, 6))
     tangent, length = jax.vmap(motion_reference.generator.apply, (None, 0, None, None))(
         generator, noise, 0, 1
@@ -248,8 +257,6 @@ def test_reference_networks_run_narrow_with_tangent_output(chart):
     assert len({*np.asarray(scores).tolist()}) == 4
     other = motion_reference.critic.apply(critic, tangent[0], length[0], 1, 0)
     assert float(other) != float(scores[0])
-    slope = jax.grad(lambda p: motion_reference.generator.apply(p, noise[0], 0, 1)[0].sum())(generator)
-    assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(slope.chart))
 
 
 @pytest.mark.slow

@@ -1,0 +1,173 @@
+"""The command line: `facejax generate | demo | labels | data | view`. A thin skin over the library.
+
+Bad input ends with one line on standard error, exit code 2, and nothing written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, subcommand
+
+Format = Literal["glb", "html", "webp", "gif", "mp4", "png", "npz", "ply", "obj"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Generate:
+    """Animate a neutral face through two or more expressions."""
+
+    end: str
+    """Expression to arrive at; `facejax labels` lists them."""
+    out: Path
+    """Folder for the results; made if it is missing."""
+    start: str = "neutral"
+    """Expression to start from."""
+    then: UseAppendAction[tuple[str, ...]] = ()
+    """A further expression; may be given several times."""
+    face: Path | None = None
+    """Neutral face (PLY, OBJ or NPZ): the model's 3,260 vertices, or a MakeHuman body. Default: the average face."""
+    model: Path | None = None
+    """Weights to use in place of the released ones."""
+    seed: int = 7
+    """Another seed, another motion."""
+    samples: int = 1
+    """How many motions to draw."""
+    frames: int = 30
+    """Frames of each transition."""
+    fps: float = 30.0
+    """Frames per second of the results."""
+    intensity: float = 1.0
+    """Scale of the motion, 0 to 2."""
+    formats: tuple[Format, ...] = ("glb", "html", "webp")
+    """What to write; the landmarks come as `landmarks.npz` in any case. "ply" and "obj" write a folder of frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Animate three unseen faces: neutral, high_smile, mouth_open, neutral."""
+
+    out: Path = Path("runs/demo")
+    """Folder for the results."""
+    seed: int = 7
+    """Another seed, other motions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Labels:
+    """List the expressions that the model knows."""
+
+    model: Path | None = None
+    """Weights to ask in place of the released ones."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """Prepare the free 4D dataset, or write neutral faces to try (`--sample`)."""
+
+    dataset: Positional[Literal["makehuman"]]
+    """Which dataset."""
+    sample: Path | None = None
+    """Write neutral faces into this folder, and prepare nothing."""
+    count: int = 5
+    """How many faces to write."""
+    level: Literal[0, 1, 2, 3] = 3
+    """Realism of the dataset."""
+    head_motion: bool = False
+    """Let heads turn and lean."""
+    out: Path | None = None
+    """Where the dataset goes; the user's cache by default."""
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Show an animation or a mesh: writes one HTML page and opens it."""
+
+    file: Positional[Path]
+    """NPZ with `vertices` and `faces`, PLY, OBJ, or an HTML page made before."""
+    out: Path | None = None
+    """Where the page goes; beside the file by default."""
+    fps: float | None = None
+    """Frames per second; the file's own, or 30."""
+    open: bool = True
+    """Open the page in a browser."""
+
+
+Command = (
+    Annotated[Generate, subcommand("generate", prefix_name=False)]
+    | Annotated[Demo, subcommand("demo", prefix_name=False)]
+    | Annotated[Labels, subcommand("labels", prefix_name=False)]
+    | Annotated[Data, subcommand("data", prefix_name=False)]
+    | Annotated[View, subcommand("view", prefix_name=False)]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the `facejax` command."""
+    command = tyro.cli(Command, prog="facejax", description="4D facial expressions.", args=arguments)
+    try:
+        _COMMANDS[type(command)](command)
+    except BrokenPipeError:
+        # Somebody closed our output, `head` say: that is no error of theirs.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"facejax: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def _generate(command: Generate) -> None:
+    from facejax import produce
+
+    neutral, notes = produce.neutral_face(command.face, command.model)
+    for note in notes:
+        print(f"{command.face}: {note}", file=sys.stderr)
+    labels = (command.start, command.end, *command.then)
+    done = produce.generate(
+        neutral, labels, command.out, model=command.model, seed=command.seed, samples=command.samples,
+        frames=command.frames, fps=command.fps, intensity=command.intensity, formats=command.formats,
+    )  # fmt: skip
+    print("\n".join(str(path) for path in done))
+
+
+def _demo(command: Demo) -> None:
+    from facejax import produce
+
+    print(produce.demo(command.out, seed=command.seed).read_text())
+
+
+def _labels(command: Labels) -> None:
+    from facejax import produce
+
+    print("\n".join(produce.labels(command.model)))
+
+
+def _data(command: Data) -> None:
+    from facejax import produce
+
+    if command.sample is not None:
+        print("\n".join(str(path) for path in produce.sample_faces(command.sample, command.count)))
+    else:
+        print(produce.prepare(command.level, head_motion=command.head_motion, folder=command.out))
+
+
+def _view(command: View) -> None:
+    from facejax import produce
+
+    page = produce.view(command.file, command.out, fps=command.fps)
+    print(page)
+    if command.open:
+        webbrowser.open(page.resolve().as_uri())
+
+
+_COMMANDS = {Generate: _generate, Demo: _demo, Labels: _labels, Data: _data, View: _view}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Spirals as sparse maps: what every spiral position of every vertex reads, and the same table read backwards.
+
+A spiral convolution on an upsampled signal is, per spiral position s, a sparse V x M matrix: row v holds the barycentric
+weights of the coarse vertices under the s-th vertex of v's spiral. Its product with dense rows is a sum of K gathers. The
+gradient needs the transpose, which would be a scatter. XLA's scatter on a CPU takes ten times longer per row than its
+gather, so a second table lists for every coarse vertex where it is read: as many slots as nine vertices in ten need,
+and a short remainder that is scattered.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Stencil(NamedTuple):
+    """S sparse maps from M to V vertices. Unused slots have index 0 and weight 0.
+
+    The maps: out[v] = sum_k weight[s, k, v] x[source[s, k, v]].
+    Transposed: out[m] = sum_j back_weight[s, j, m] g[back[s, j, m]], plus rest_weight[s, r] g[rest_from[s, r]]
+    for every r with rest_to[s, r] = m.
+    """
+
+    source: np.ndarray  # (S, K, V) int32, below M
+    weight: np.ndarray  # (S, K, V) float32
+    back: np.ndarray  # (S, J, M) int32, below V
+    back_weight: np.ndarray  # (S, J, M) float32
+    rest_from: np.ndarray  # (S, R) int32, below V
+    rest_to: np.ndarray  # (S, R) int32, below M
+    rest_weight: np.ndarray  # (S, R) float32
+
+
+def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
+    """The maps of spirals (V, S) on a signal that `corners` and `weights` (V, K) lift from `coarse` vertices."""
+    count, length = spirals.shape
+    real = spirals < count
+    spirals = np.where(real, spirals, 0)
+    source = np.transpose(corners[spirals], (1, 2, 0))
+    weight = np.transpose(weights[spirals] * real[..., None], (1, 2, 0)).astype(np.float32)
+    source = np.where(weight > 0, source, 0).astype(np.int32)
+
+    position, _, reader = np.nonzero(weight)
+    target, value = source[weight > 0], weight[weight > 0]
+    # Entries of one (position, target) side by side, each with its place in that list.
+    bucket = position * coarse + target
+    order = np.argsort(bucket, kind="stable")
+    bucket, reader, value = bucket[order], reader[order], value[order]
+    sizes = np.bincount(bucket, minlength=length * coarse)
+    place = np.arange(len(bucket)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    position, target = np.divmod(bucket, coarse)
+
+    slots = max(1, int(np.quantile(sizes, 0.9)))
+    back = np.zeros((length, slots, coarse), np.int32)
+    back_weight = np.zeros((length, slots, coarse), np.float32)
+    fits = place < slots
+    back[position[fits], place[fits], target[fits]] = reader[fits]
+    back_weight[position[fits], place[fits], target[fits]] = value[fits]
+
+    position, target, reader, value = (a[~fits] for a in (position, target, reader, value))
+    sizes = np.bincount(position, minlength=length)
+    place = np.arange(len(position)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    rest_from, rest_to = np.zeros((2, length, sizes.max()), np.int32)
+    rest_weight = np.zeros((length, sizes.max()), np.float32)
+    rest_from[position, place], rest_to[position, place], rest_weight[position, place] = reader, target, value
+    return Stencil(source, weight, back, back_weight, rest_from, rest_to, rest_weight)
+
+
+def flat(spirals: np.ndarray) -> Stencil:
+    """The maps of spirals (V, S) on a signal of the same V vertices."""
+    own = np.arange(len(spirals))[:, None]
+    return build(spirals, own, np.ones_like(own, np.float32), len(spirals))

@@ -1,0 +1,28 @@
+"""Files and folders appear whole or not at all."""
+
+import pytest
+
+from facejax import files
+
+
+def test_replacing_leaves_nothing_behind(tmp_path):
+    target = tmp_path / "a" / "file.txt"
+    with pytest.raises(RuntimeError), files.replacing(target) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert list(target.parent.iterdir()) == []
+    with files.replacing(target) as temporary:
+        temporary.write_text("whole")
+    assert target.read_text() == "whole" and len(list(target.parent.iterdir())) == 1
+
+
+def test_replacing_folder_replaces_or_vanishes(tmp_path):
+    target = tmp_path / "folder"
+    with pytest.raises(RuntimeError), files.replacing_folder(target) as temporary:
+        (temporary / "x").write_text("half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    for text in ("first", "second"):
+        with files.replacing_folder(target) as temporary:
+            (temporary / "x").write_text(text)
+        assert (target / "x").read_text() == text

@@ -1,0 +1,311 @@
+"""The loop: the same numbers however often it is stopped, errors that name step and term, honest records."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from facejax import journal, steps, training
+
+DATA = np.random.default_rng(0).standard_normal((50, 4)).astype(np.float32)
+OPTIMISER = optax.adam(1e-2)
+
+
+def loss(params, key, batch, constants):
+    noise = 0.01 * jax.random.normal(key, batch.shape)
+    error = jnp.mean(jnp.square((batch + noise) @ params["w"] - constants))
+    return error, {"norm": jnp.sum(jnp.square(params["w"]))}
+
+
+def start():
+    return steps.start_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
+
+
+def batches(first, count):
+    return DATA[training.epoch_indices(7, len(DATA), 8)(first, count)]
+
+
+def fit(folder, total, **options):
+    step = steps.supervised(loss, OPTIMISER)
+    return training.run(
+        step, start(), batches, folder, steps=total, constants=jnp.float32(0.5), chunk=4, **options
+    )
+
+
+def numbers(state):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state._replace(key=jax.random.key_data(state.key)))]
+
+
+def entries(folder):
+    return [{k: v for k, v in entry.items() if k != "seconds"} for entry in journal.read(folder)]
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(numbers(a), numbers(b), strict=True))
+
+
+def test_supervised_steps_are_the_plain_loop(tmp_path):
+    state = fit(tmp_path, 10)
+    params, opt_state = start().params, start().opt_state
+    values = []
+    for i in range(10):
+        key = jax.random.fold_in(jax.random.key(3), i)
+        value, slope = jax.value_and_grad(lambda p: loss(p, key, batches(i, 1)[0], 0.5)[0])(params)  # noqa: B023
+        updates, opt_state = OPTIMISER.update(slope, opt_state, params)
+        params = optax.apply_updates(params, updates)
+        values.append(float(value))
+    np.testing.assert_allclose(state.params["w"], params["w"], rtol=1e-5)
+    assert int(state.step) == 10
+    got = entries(tmp_path)
+    assert [entry["step"] for entry in got] == [4, 8, 10]
+    means = [np.mean(values[a:b]) for a, b in [(0, 4), (4, 8), (8, 10)]]
+    np.testing.assert_allclose([e["loss"] for e in got], means, rtol=1e-5)
+
+
+def test_a_run_in_pieces_gives_the_same_bits(tmp_path):
+    whole = fit(tmp_path / "whole", 20)
+    for total in (8, 8, 12, 20):
+        pieces = fit(tmp_path / "pieces", total)
+    assert same(whole, pieces)
+    assert entries(tmp_path / "whole") == entries(tmp_path / "pieces")
+    assert same(fit(tmp_path / "pieces", 20), whole)
+
+
+def test_the_callers_state_survives_the_run(tmp_path):
+    state = start()
+    training.run(
+        steps.supervised(loss, OPTIMISER), state, batches, tmp_path, steps=4, constants=jnp.float32(0)
+    )
+    np.testing.assert_array_equal(state.params["w"], np.ones((4, 2)))
+
+
+def test_entries_after_the_checkpoint_are_cut_and_a_torn_line_too(tmp_path):
+    whole = fit(tmp_path / "whole", 16)
+    fit(tmp_path / "torn", 8)
+    with (tmp_path / "torn" / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps({"step": 12, "loss": -1.0}) + '\n{"step": 16, "lo')
+    assert same(fit(tmp_path / "torn", 16), whole)
+    assert entries(tmp_path / "torn") == entries(tmp_path / "whole")
+
+
+def test_an_old_run_is_not_overwritten_unasked(tmp_path):
+    fit(tmp_path, 4)
+    with pytest.raises(ValueError, match="holds a run of 4 steps: resume it, or name another folder"):
+        fit(tmp_path, 8, resume=False)
+
+
+CHILD = """
+import sys
+sys.path.insert(0, {tests!r})
+import test_training
+slowly = test_training.batches
+def batches(first, count):
+    import time
+    time.sleep(0.03)
+    return slowly(first, count)
+test_training.batches = batches
+test_training.fit({folder!r}, 120, save_steps=4)
+print("finished", flush=True)
+"""
+
+
+def child(folder):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    code = CHILD.format(tests=str(Path(__file__).parent), folder=str(folder))
+    return subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=-1, stderr=-1, text=True)
+
+
+def killed_after(folder, lines, number, pause=0.0):
+    """Start a run, send `number` once its record holds more than `lines` lines, and return the exit code."""
+    process, record = child(folder), Path(folder) / "metrics.jsonl"
+    while process.poll() is None and (not record.exists() or record.read_text().count("\n") < lines):
+        time.sleep(0.005)
+    time.sleep(pause)
+    process.send_signal(number)
+    process.communicate()
+    return process.returncode
+
+
+def test_a_run_killed_at_odd_moments_resumes_to_the_same_bits(tmp_path):
+    whole = fit(tmp_path / "whole", 120)
+    random = np.random.default_rng(time.time_ns())  # the moments differ from run to run, the result may not
+    for lines in (3, 14):
+        assert (
+            killed_after(tmp_path / "killed", lines, signal.SIGKILL, random.uniform(0, 0.05))
+            == -signal.SIGKILL
+        )
+    assert 0 < len(entries(tmp_path / "killed")) < 30
+    assert same(fit(tmp_path / "killed", 120), whole)
+    assert entries(tmp_path / "killed") == entries(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 128 + 15), (signal.SIGINT, -2)])
+def test_a_stop_signal_saves_and_leaves(tmp_path, number, code):
+    assert killed_after(tmp_path, 5, number) == code
+    with training.Checkpoints(tmp_path / "checkpoints") as checkpoints:
+        saved = checkpoints.latest()
+    assert saved == entries(tmp_path)[-1]["step"] and saved < 120
+
+
+def test_a_run_outside_the_main_thread_leaves_signals_alone(tmp_path):
+    got = []
+    thread = threading.Thread(target=lambda: got.append(fit(tmp_path, 4)))
+    thread.start()
+    thread.join()
+    assert int(got[0].step) == 4
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "saved", "message"),
+    [
+        (6, jnp.nan, "none", r"curse became nan in step 7; there is no checkpoint yet"),
+        (6, jnp.inf, "some", r"curse became inf in step 7; the last good checkpoint is step 4"),
+        (3, -2e6, "none", r"curse became -2000000.0 in step 4; there is no checkpoint yet"),
+    ],
+)
+def test_a_loss_gone_wrong_stops_with_step_term_and_checkpoint(tmp_path, at, value, saved, message):
+    def cursed(state, batch, constants):
+        state = state._replace(step=state.step + 1)
+        return state, {"fine": jnp.float32(1), "curse": jnp.where(state.step > at, value, 0.0)}
+
+    with pytest.raises(training.TrainingError, match=message):
+        training.run(
+            cursed, start(), batches, tmp_path, steps=20, chunk=4, save_steps=4 if saved == "some" else None
+        )
+    assert all(entry["step"] <= at for entry in entries(tmp_path))
+
+
+def test_epoch_indices_show_each_sample_once_an_epoch_in_an_order_of_its_own():
+    indices = training.epoch_indices(1, 10, 4)
+    stream = indices(0, 25).ravel()
+    epochs = stream.reshape(10, 10)
+    assert all(sorted(epoch) == list(range(10)) for epoch in epochs)
+    assert len({tuple(epoch) for epoch in epochs}) == 10
+    assert indices(0, 25).shape == (25, 4) and indices(0, 25).dtype == np.int32
+    assert not np.array_equal(stream, training.epoch_indices(2, 10, 4)(0, 25).ravel())
+
+
+@pytest.mark.parametrize(("size", "batch"), [(10, 4), (4, 10), (1, 1), (12, 4)])
+def test_epoch_indices_depend_on_the_step_alone(size, batch):
+    whole = training.epoch_indices(5, size, batch)(0, 30)
+    for first, count in [(0, 1), (7, 5), (29, 1), (3, 27)]:
+        np.testing.assert_array_equal(
+            training.epoch_indices(5, size, batch)(first, count), whole[first : first + count]
+        )
+
+
+def test_epoch_indices_refuse_nothing():
+    with pytest.raises(ValueError, match="at least 1; got 0 and 4"):
+        training.epoch_indices(0, 0, 4)
+
+
+def test_gathered_steps_take_indices(tmp_path):
+    step = training.gathered(steps.supervised(loss, OPTIMISER))
+    held = (jnp.asarray(DATA), jnp.float32(0.5))
+    indices = training.epoch_indices(7, len(DATA), 8)
+    state = training.run(step, start(), indices, tmp_path / "indices", steps=8, constants=held, chunk=4)
+    assert same(state, fit(tmp_path / "plain", 8))
+
+
+def adversarial(optimiser, critic_steps):
+    def generate(weights, constants, key, condition):
+        return weights["g"][condition] + constants * jax.random.normal(key, (2,))
+
+    def score(weights, constants, sample, condition):
+        return jnp.tanh(sample @ weights["c"][condition]).sum()
+
+    def terms(constants, fake, real, condition):
+        return {"pull": 0.1 * jnp.mean(jnp.abs(fake - real))}
+
+    players = steps.Players(optimiser, optimiser)
+    step = steps.adversarial(generate, score, players, critic_steps=critic_steps, terms=terms, decay=0.9)
+    weights = steps.Players({"g": jnp.zeros((3, 2))}, {"c": 0.5 * jnp.ones((3, 2, 4))})
+    return step, steps.start_adversarial(weights, players, jax.random.key(0))
+
+
+def test_an_adversarial_step_moves_the_critic_first_and_averages_the_generator():
+    step, state = adversarial(optax.sgd(0.1), critic_steps=3)
+    real, condition = jax.random.normal(jax.random.key(1), (12, 2)), jnp.arange(12) % 3
+    after, metrics = jax.jit(step)(state, (real, condition), jnp.float32(0.0))
+    assert set(metrics) == {"wasserstein", "slope", "adversarial", "pull"}
+    critic, fake = state.params.critic["c"], jnp.zeros(2)
+    chord_key = jax.random.split(jax.random.fold_in(jax.random.key(0), 0), 3)[1]
+    for i, key in enumerate(jax.random.split(chord_key, 3)):
+        rows = slice(4 * i, 4 * i + 4)
+
+        def critic_loss(c, key=key, rows=rows):
+            tau = jax.random.uniform(key, (4,))
+            total = 0.0
+            for t, x, label in zip(tau, real[rows], condition[rows], strict=True):
+                slope = jax.grad(lambda y, label=label: jnp.tanh(y @ c[label]).sum())((1 - t) * x)
+                total += jnp.tanh(fake @ c[label]).sum() - jnp.tanh(x @ c[label]).sum()
+                total += 10.0 * (jnp.linalg.norm(slope) - 1.0) ** 2
+            return total / 4
+
+        critic = critic - 0.1 * jax.jit(jax.grad(critic_loss))(critic)
+    np.testing.assert_allclose(after.params.critic["c"], critic, rtol=1e-4, atol=1e-6)
+
+    def generator_loss(g):
+        played = zip(real[8:], condition[8:], strict=True)
+        return sum(
+            -jnp.tanh(g[c] @ critic[c]).sum() / 4 + 0.1 * jnp.abs(g[c] - x).sum() / 8 for x, c in played
+        )
+
+    expected = -0.1 * jax.jit(jax.grad(generator_loss))(jnp.zeros((3, 2)))
+    np.testing.assert_allclose(after.params.generator["g"], expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(after.extra["g"], 0.1 * after.params.generator["g"], rtol=1e-5)
+
+
+def test_adversarial_batches_must_divide():
+    step, state = adversarial(optax.sgd(0.1), critic_steps=5)
+    with pytest.raises(ValueError, match="multiple of critic_steps = 5 samples; got 12"):
+        step(state, (jnp.zeros((12, 2)), jnp.zeros(12, int)), jnp.float32(0.1))
+
+
+def test_a_terminal_gets_a_bar_and_others_get_lines(tmp_path, monkeypatch, capsys):
+    fit(tmp_path / "lines", 8)
+    assert "step 8/8  loss " in capsys.readouterr().err
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    fit(tmp_path / "bar", 8)
+    assert "8/8" in terminal.getvalue() and "step 8/8" not in terminal.getvalue()
+
+
+def test_tensorboard_gets_every_entry_or_a_hint(tmp_path, monkeypatch):
+    written = []
+
+    class Writer:
+        def __init__(self, folder):
+            written.append(Path(folder).name)
+
+        def add_scalar(self, name, value, step):
+            written.append((name, step))
+
+        def close(self):
+            written.append("closed")
+
+    module = type(sys)("tensorboardX")
+    module.SummaryWriter = Writer
+    monkeypatch.setitem(sys.modules, "tensorboardX", module)
+    fit(tmp_path / "with", 8, tensorboard=True)
+    assert written == ["tensorboard", *[(n, s) for s in (4, 8) for n in ("loss", "norm")], "closed"]
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'facejax\[tensorboard\]'"):
+        fit(tmp_path / "without", 8, tensorboard=True)
