@@ -72,7 +72,13 @@ def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None
 
 
 def finish(
-    name: str, config: Any, metrics: dict[str, Any], *, made: dict[str, Any], table: str, figure: Path | None = None
+    name: str,
+    config: Any,
+    metrics: dict[str, Any],
+    *,
+    made: dict[str, Any],
+    table: str,
+    figure: Path | None = None,
 ) -> None:
     """Write the config, the metrics with their record, and the table; publish them if asked."""
     out = Path(config.out)
@@ -80,7 +86,8 @@ def finish(
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(config).items()}
     write_text(out / "config.json", json.dumps(plain, indent=1) + "\n")
     write_text(out / "metrics.json", json.dumps(document, indent=1, default=_plain) + "\n")
-    body = f"{table}\n\nMade by `{made['command']}` in {made['seconds']:.0f} s (commit {made['commit']}, {made['date']}).\n"
+    source = f"`{made['command']}` in {made['seconds']:.0f} s (commit {made['commit']}, {made['date']})"
+    body = f"{table}\n\nMade by {source}.\n"
     write_text(out / "table.md", body)
     if config.publish:
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
@@ -112,7 +119,11 @@ def _plain(value: Any) -> Any:
 
 def _commit() -> str:
     done = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=RESULTS.parent, check=False
+        ["git", "describe", "--always", "--dirty"],
+        capture_output=True,
+        text=True,
+        cwd=RESULTS.parent,
+        check=False,
     )
     return done.stdout.strip() or "unknown"
 

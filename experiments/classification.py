@@ -1,8 +1,9 @@
 """Are generated transitions recognised as what they should be? OT23's classification test (4.3, Table 5).
 
-A random forest of 300 trees sees 30 x 204 displacements from neutral. It is trained on the training subjects' transitions of
-the 39 pairs of Table 5 (halves, and peak -> peak on geodesics) and judges 64 generated samples of each pair. Beside it: real
-transitions of held-out subjects made the same way (the ceiling), and direct performances, which do not follow geodesics.
+A random forest of 300 trees sees 30 x 204 displacements from neutral. It is trained on the training subjects'
+transitions of the 39 pairs of Table 5 (halves, and peak -> peak on geodesics) and judges 64 generated samples of
+each pair. Beside it: real transitions of held-out subjects made the same way (the ceiling), and direct
+performances, which do not follow geodesics.
 
     python -m experiments.classification --publish
 

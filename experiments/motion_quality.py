@@ -1,9 +1,10 @@
 """Do generated motions move like real ones? Amplitude, jitter and diversity against held-out subjects.
 
-Amplitude: mean peak displacement of neutral -> expression, per expression, against the mean of 40 held-out subjects. Jitter:
-mean acceleration of the landmarks (second differences at 30 frames). Diversity: mean pairwise distance of samples of one
-pair, equal counts, generated against real. All 306 + 36 pairs of 18 expressions and neutral that data exist for; real
-peak -> peak transitions are made as those that the generator learnt from, of held-out subjects.
+Amplitude: mean peak displacement of neutral -> expression, per expression, against the mean of 40 held-out
+subjects. Jitter: mean acceleration of the landmarks (second differences at 30 frames). Diversity: mean pairwise
+distance of samples of one pair, equal counts, generated against real. All 306 + 36 pairs of 18 expressions and
+neutral that data exist for; real peak -> peak transitions are made as those that the generator learnt from, of
+held-out subjects.
 
     python -m experiments.motion_quality --publish
 
@@ -26,7 +27,7 @@ from facejax import fitting, metrics, pipeline
 from facejax.data import makehuman4d, motions
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 
 @dataclasses.dataclass(frozen=True)

@@ -103,9 +103,7 @@ def transition(
     return start + (jnp.exp(log_length) / q1.shape[-3])[..., None, None] * moves
 
 
-def transitions(
-    motions: Motions, pairs: np.ndarray, *, frames: int = 30, chunk: int = 128
-) -> Iterator[jax.Array]:
+def transitions(motions: Motions, pairs: np.ndarray, *, frames: int = 30, chunk: int = 128) -> Iterator[jax.Array]:
     """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
 
     Memory does not grow with P. The last chunk is padded inside, so that all share one compilation. Raises
@@ -130,9 +128,7 @@ def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.nda
     peaks, labels = _labelled(peaks, labels, classes)
     counts = np.bincount(labels, minlength=classes)
     if not counts.all():
-        raise ValueError(
-            f"labels: expected every class at least once, got none of {np.flatnonzero(counts == 0)}"
-        )
+        raise ValueError(f"labels: expected every class at least once, got none of {np.flatnonzero(counts == 0)}")
     sums = np.zeros((classes, *peaks.shape[1:]))
     np.add.at(sums, labels, peaks)
     return sums / counts[:, None, None]
@@ -197,9 +193,7 @@ def _between(tau: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
 @jax.jit(static_argnames=("frames",))
 def _chunk(motions: Motions, pairs: jax.Array, *, frames: int) -> jax.Array:
     first, second = (jax.tree.map(lambda x, rows=rows: x[rows], motions) for rows in pairs.T)
-    return transition(
-        first.q, first.log_length, second.q, second.log_length, first.start, second.start, frames=frames
-    )
+    return transition(first.q, first.log_length, second.q, second.log_length, first.start, second.start, frames=frames)
 
 
 def _stream(motions: Motions, pairs: np.ndarray, frames: int, chunk: int) -> Iterator[jax.Array]:

@@ -76,18 +76,14 @@ class Checkpoints:
         try:
             stored = weights.names(self._manager.item_metadata(step).tree)
         except Exception as error:
-            raise CheckpointError(
-                f"{place} is damaged ({error}); delete it to go on from an older one"
-            ) from error
+            raise CheckpointError(f"{place} is damaged ({error}); delete it to go on from an older one") from error
         if wrong := weights.mismatches(weights.names(jax.tree.map(_as_stored, like)), stored):
             raise CheckpointError(f"{place} was written by another model: {'; '.join(wrong)}")
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         try:
             return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
         except Exception as error:
-            raise CheckpointError(
-                f"{place} is damaged ({error}); delete it to go on from an older one"
-            ) from error
+            raise CheckpointError(f"{place} is damaged ({error}); delete it to go on from an older one") from error
 
     def wait(self) -> None:
         """Return when every write has reached the disk."""

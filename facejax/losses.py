@@ -20,9 +20,7 @@ Condition = Any
 Score = Callable[[Sample, Condition], jax.Array]
 
 
-def gradient_penalty(
-    score: Score, key: jax.Array, real: Sample, fake: Sample, condition: Condition
-) -> jax.Array:
+def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, condition: Condition) -> jax.Array:
     """Mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
 
     `real`, `fake`: trees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all
@@ -97,9 +95,7 @@ def weighted_l1(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> 
     """
     _same_shape(predicted, target)
     if weights.shape != predicted.shape[-2:-1]:
-        raise ValueError(
-            f"weights must have shape {predicted.shape[-2:-1]}, one per vertex; got {weights.shape}"
-        )
+        raise ValueError(f"weights must have shape {predicted.shape[-2:-1]}, one per vertex; got {weights.shape}")
     return jnp.mean(weights * jnp.sum(jnp.abs(predicted - target), axis=-1))
 
 
@@ -161,6 +157,4 @@ def landmark_weights(
 
 def _same_shape(predicted: jax.Array, target: jax.Array) -> None:
     if predicted.shape != target.shape:
-        raise ValueError(
-            f"predicted and target must have one shape; got {predicted.shape} and {target.shape}"
-        )
+        raise ValueError(f"predicted and target must have one shape; got {predicted.shape} and {target.shape}")

@@ -43,9 +43,7 @@ def vertex_error(predicted: jax.Array, target: jax.Array, mask: jax.Array | None
     distance = vertex_distance(predicted, target)
     if mask is not None and jnp.shape(mask) != distance.shape[-1:]:
         raise ValueError(f"mask: expected ({distance.shape[-1]},), got {jnp.shape(mask)}")
-    weights = (
-        jnp.ones(distance.shape[-1], distance.dtype) if mask is None else jnp.asarray(mask, distance.dtype)
-    )
+    weights = jnp.ones(distance.shape[-1], distance.dtype) if mask is None else jnp.asarray(mask, distance.dtype)
     share = weights / jnp.sum(weights)
     # Vertices first, frames after: one float32 sum over 10^8 numbers would lose digits.
     mean = jnp.mean(distance @ share)
@@ -146,9 +144,7 @@ def _norm(vectors: jax.Array) -> jax.Array:
 
 def _check_same(a: jax.Array, b: jax.Array, axes: int) -> None:
     if jnp.shape(a) != jnp.shape(b) or jnp.ndim(a) < axes or jnp.shape(a)[-1] != 3:
-        raise ValueError(
-            f"expected two arrays (..., N, 3) of one shape, got {jnp.shape(a)} and {jnp.shape(b)}"
-        )
+        raise ValueError(f"expected two arrays (..., N, 3) of one shape, got {jnp.shape(a)} and {jnp.shape(b)}")
 
 
 def _check_motion(motion: jax.Array, least: int, axes: int = 3) -> None:

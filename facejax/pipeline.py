@@ -24,7 +24,8 @@ from facejax import weights
 from facejax.geometry import align, srvf
 from facejax.io import dress
 from facejax.mesh import topology
-from facejax.models import decoder, motion, starts
+from facejax.mesh.stencils import Stencil
+from facejax.models import charts, decoder, motion, starts
 
 RATE = 30.0  # frames per second of the motions that the generator learnt
 RELEASED = "makehuman4d.safetensors"
@@ -62,8 +63,9 @@ def load(path: str | os.PathLike | None = None) -> Models:
     except (KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
     tree, about = weights.load(path, like)
-    tree = jax.tree.map(jnp.asarray, tree) | {"face": Face(*tree["face"])}
-    return Models(labels=tuple(about["labels"]), about=about, **tree)
+    # The face and its props stay on the host: they are read by exporters, not by networks.
+    moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in ("motion", "starts", "hierarchy", "decoder")}
+    return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
 
 
 def save(path: str | os.PathLike, models: Models) -> None:
@@ -87,8 +89,10 @@ def landmarks(
     """Landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`.
 
     `frames` is the length of one transition; T = 1 + (frames - 1) x transitions, joints not repeated. A motion that
-    does not start at neutral starts at a peak drawn for it (`facejax.models.starts`), scaled to the face. `intensity` scales all displacements
-    from neutral. Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
+    does not start at neutral starts at a peak drawn for it (`facejax.models.starts`), scaled to the face. `intensity`
+    scales all displacements from neutral.
+
+    Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
     """
     if not 0 <= intensity <= 2:
         raise ValueError(f"intensity must lie in 0..2, got {intensity}")
@@ -186,5 +190,34 @@ def _decode(params, hierarchy, displacements, neutral):
 
 
 def _structure(shapes: dict[str, list]) -> dict[str, Any]:
-    """The tree to expect, rebuilt from the leaf names and shapes that the file states."""
-    raise RuntimeError
+    """The tree to expect, rebuilt from the leaf names, dtypes and shapes that a file states.
+
+    Raises `KeyError` or `TypeError` where the names are not those of our records.
+    """
+    nested: dict[str, Any] = {}
+    for name, (dtype, shape) in shapes.items():
+        *path, last = name.split("/")
+        inner = nested
+        for step in path:
+            inner = inner.setdefault(step, {})
+        inner[last] = jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
+    tables = nested["hierarchy"]
+    climbs = [Stencil(**row) for row in _listed(tables.pop("climbs"))]
+    surface = Stencil(**tables.pop("surface"))
+    levels = {name: tuple(_listed(rows)) for name, rows in tables.items()}
+    networks = {}
+    for name in ("motion", "decoder"):
+        weights = nested[name]["weights"]
+        networks[name] = weights | {key: _listed(weights[key]) for key in ("blocks", "convs") if key in weights}
+    return {
+        "face": Face(**nested["face"]),
+        "props": dress.Props(**nested["props"]),
+        "motion": motion.Params(charts.Chart(**nested["motion"]["chart"]), networks["motion"]),
+        "starts": starts.Params(**nested["starts"]),
+        "hierarchy": topology.Hierarchy(climbs=tuple(climbs), surface=surface, **levels),
+        "decoder": decoder.Params(decoder.Scale(**nested["decoder"]["scale"]), networks["decoder"]),
+    }
+
+
+def _listed(rows: dict[str, Any]) -> list:
+    return [rows[str(i)] for i in range(len(rows))]

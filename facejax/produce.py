@@ -101,7 +101,10 @@ def neutral_face(path: Path | None, model: Path | None = None) -> tuple[np.ndarr
     face = pipeline.load(model).face
     if path is None:
         return np.asarray(face.vertices), ()
-    found = faces.read(path, faces.Topology(*(np.asarray(x) for x in (face.vertices, face.landmark_index, face.source_index))))
+    found = faces.read(
+        path,
+        faces.Topology(*(np.asarray(x) for x in (face.vertices, face.landmark_index, face.source_index))),
+    )
     return found.vertices, found.notes
 
 

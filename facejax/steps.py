@@ -99,9 +99,7 @@ def adversarial(
             return adversarial + sum(added.values()), {"adversarial": adversarial, **added}
 
         slope, played = jax.grad(play, has_aux=True)(generator)
-        generator, generator_state = _descend(
-            optimisers.generator, slope, state.opt_state.generator, generator
-        )
+        generator, generator_state = _descend(optimisers.generator, slope, state.opt_state.generator, generator)
         average = optax.incremental_update(generator, state.extra, 1.0 - decay)
         opt_state = Players(generator_state, critic_state)
         state = TrainState(state.step + 1, Players(generator, critic), opt_state, state.key, average)

@@ -69,9 +69,7 @@ def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.n
 
 def gathered(step: Step) -> Step:
     """Let `step` take indices as its batch and (data, constants) as constants: data stay on the device."""
-    return lambda state, indices, held: step(
-        state, jax.tree.map(lambda leaf: leaf[indices], held[0]), held[1]
-    )
+    return lambda state, indices, held: step(state, jax.tree.map(lambda leaf: leaf[indices], held[0]), held[1])
 
 
 def run(
@@ -107,9 +105,7 @@ def run(
 
     with Checkpoints(folder / "checkpoints", keep=keep) as checkpoints, _stop_signals() as stopped:
         if not resume and checkpoints.latest() is not None:
-            raise ValueError(
-                f"{folder} holds a run of {checkpoints.latest()} steps: resume it, or name another folder"
-            )
+            raise ValueError(f"{folder} holds a run of {checkpoints.latest()} steps: resume it, or name another folder")
         # Copied, since the first chunk would donate the caller's own arrays.
         state = jax.tree.map(jnp.copy, state) if checkpoints.latest() is None else checkpoints.restore(state)
         done = saved = int(state.step)
@@ -141,12 +137,8 @@ def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int 
     bad = [(int(np.argmax(where)), name) for name, where in wrong.items() if where.any()]
     if bad:
         at, name = min(bad)
-        last = (
-            f"the last good checkpoint is step {saved}" if saved is not None else "there is no checkpoint yet"
-        )
-        raise TrainingError(
-            f"{name} became {metrics[name][at]} in step {first + at + 1}; {last}, in {folder}"
-        )
+        last = f"the last good checkpoint is step {saved}" if saved is not None else "there is no checkpoint yet"
+        raise TrainingError(f"{name} became {metrics[name][at]} in step {first + at + 1}; {last}, in {folder}")
 
 
 @contextmanager

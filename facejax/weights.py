@@ -32,9 +32,7 @@ def names(tree: Tree) -> dict[str, Any]:
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         if name in leaves:
-            raise ValueError(
-                f"two leaves of the tree are both named {name!r}; rename a key that contains '/'"
-            )
+            raise ValueError(f"two leaves of the tree are both named {name!r}; rename a key that contains '/'")
         leaves[name] = leaf
     return leaves
 
@@ -93,15 +91,11 @@ def _open(path: str | os.PathLike):
     except FileNotFoundError:
         raise WeightsError(f"there is no weights file {path}") from None
     except (SafetensorError, OSError) as error:
-        raise WeightsError(
-            f"{path} is not a whole safetensors file ({error}); fetch or write it anew"
-        ) from error
+        raise WeightsError(f"{path} is not a whole safetensors file ({error}); fetch or write it anew") from error
 
 
 def _metadata(path: str | os.PathLike, file) -> dict[str, Any]:
     try:
         return json.loads((file.metadata() or {})[_HEADER])
     except (KeyError, json.JSONDecodeError):
-        raise WeightsError(
-            f"{path} is a safetensors file, but its header lacks the {_HEADER!r} entry"
-        ) from None
+        raise WeightsError(f"{path} is a safetensors file, but its header lacks the {_HEADER!r} entry") from None

@@ -72,9 +72,7 @@ def test_transition_goes_from_peak_to_peak_and_backwards(x64):
     there = augment.transition(*arguments(motions, 0, 1), frames=9)
     np.testing.assert_allclose(there[0], curves[0, -1], atol=1e-13)
     np.testing.assert_allclose(there[-1], curves[1, -1], atol=1e-13)
-    np.testing.assert_allclose(
-        augment.transition(*arguments(motions, 1, 0), frames=9), there[::-1], atol=1e-13
-    )
+    np.testing.assert_allclose(augment.transition(*arguments(motions, 1, 0), frames=9), there[::-1], atol=1e-13)
 
 
 def test_transition_to_itself_stays_at_the_peak(x64):
@@ -161,9 +159,7 @@ def test_apex_and_halves_share_the_peak():
 def test_prototypes_against_a_loop():
     random = np.random.default_rng(2)
     peaks, labels = random.normal(size=(9, 4, 3)), np.asarray([0, 1, 2, 0, 1, 2, 2, 2, 0])
-    expected = [
-        sum(p for p, k in zip(peaks, labels, strict=True) if k == c) / np.sum(labels == c) for c in range(3)
-    ]
+    expected = [sum(p for p, k in zip(peaks, labels, strict=True) if k == c) / np.sum(labels == c) for c in range(3)]
     np.testing.assert_allclose(augment.prototypes(peaks, labels, classes=3), expected, atol=1e-15)
 
 
@@ -214,9 +210,7 @@ def test_select_does_not_form_all_pairs():
 
 
 def test_select_on_ties_gives_the_lower_indices():
-    chosen = augment.select(
-        np.zeros((6, 2, 3)), np.asarray([1, 1, 0, 0, 0, 1]), np.zeros((2, 2, 3)), per_pair=2
-    )
+    chosen = augment.select(np.zeros((6, 2, 3)), np.asarray([1, 1, 0, 0, 0, 1]), np.zeros((2, 2, 3)), per_pair=2)
     assert chosen.pairs.tolist() == [[2, 0], [2, 1], [0, 2], [0, 3]]
 
 

@@ -24,9 +24,7 @@ def state(seed: int = 0) -> State:
 
 
 def plain(tree):
-    return jax.tree.map(
-        lambda a: jax.random.key_data(a) if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a, tree
-    )
+    return jax.tree.map(lambda a: jax.random.key_data(a) if jnp.issubdtype(a.dtype, jax.dtypes.prng_key) else a, tree)
 
 
 def test_round_trip_keeps_tree_values_and_keys(tmp_path):

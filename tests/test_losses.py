@@ -42,9 +42,7 @@ def test_with_equal_weights_the_papers_loss_is_one_tenth_more_than_its_first_ter
 def test_the_neutral_face_cancels_and_units_scale():
     neutral = RNG.standard_normal((7, 3)).astype(np.float32)
     a = losses.weighted_l1(PREDICTED, TARGET, WEIGHTS)
-    np.testing.assert_allclose(
-        losses.weighted_l1(PREDICTED + neutral, TARGET + neutral, WEIGHTS), a, rtol=1e-5
-    )
+    np.testing.assert_allclose(losses.weighted_l1(PREDICTED + neutral, TARGET + neutral, WEIGHTS), a, rtol=1e-5)
     np.testing.assert_allclose(losses.weighted_l1(10 * PREDICTED, 10 * TARGET, WEIGHTS), 10 * a, rtol=1e-5)
     assert float(losses.weighted_l1(TARGET, TARGET, WEIGHTS)) == 0.0
 
@@ -123,9 +121,7 @@ def test_penalty_is_taken_on_the_chords():
     real, fake = np.array([[1.0, 0.0]], np.float32), np.array([[0.0, 2.0]], np.float32)
     taken = []
     for seed in range(200):
-        penalty = losses.gradient_penalty(
-            lambda x, _: jnp.sum(x**2) / 2, jax.random.key(seed), real, fake, np.zeros(1)
-        )
+        penalty = losses.gradient_penalty(lambda x, _: jnp.sum(x**2) / 2, jax.random.key(seed), real, fake, np.zeros(1))
         tau = float(jax.random.uniform(jax.random.key(seed), (1,))[0])
         point = (1 - tau) * real + tau * fake
         np.testing.assert_allclose(penalty, (np.linalg.norm(point) - 1) ** 2, atol=1e-5)
@@ -147,9 +143,7 @@ def test_critic_loss_is_its_terms_and_the_generator_answers_it():
 
 def test_a_critic_without_slope_has_a_finite_gradient():
     def loss(scale):
-        return losses.critic(
-            lambda x, _: scale * jnp.sum(x["v"]) * 0, jax.random.key(0), REAL, FAKE, CONDITION
-        )[0]
+        return losses.critic(lambda x, _: scale * jnp.sum(x["v"]) * 0, jax.random.key(0), REAL, FAKE, CONDITION)[0]
 
     assert float(loss(1.0)) == 10.0 and np.isfinite(jax.grad(loss)(1.0))
 
@@ -159,6 +153,4 @@ def test_penalty_gradient_equals_finite_differences():
         score = lambda x, c: jnp.sum(jnp.tanh(w[c] * x["v"])) + w[0, 0, 0] * x["s"]  # noqa: E731
         return losses.critic(score, jax.random.key(1), REAL, FAKE, CONDITION)[0]
 
-    check_grads(
-        lambda w: loss(jnp.asarray(w)), (jnp.asarray(DIRECTION),), 1, modes=["rev"], eps=1e-2, rtol=2e-2
-    )
+    check_grads(lambda w: loss(jnp.asarray(w)), (jnp.asarray(DIRECTION),), 1, modes=["rev"], eps=1e-2, rtol=2e-2)

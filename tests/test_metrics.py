@@ -20,9 +20,7 @@ def random(seed, *shape):
 
 
 def loop_motion_distance(a, b):
-    distances = [
-        np.sqrt(np.sum((p - q) ** 2)) for x, y in zip(a, b, strict=True) for p, q in zip(x, y, strict=True)
-    ]
+    distances = [np.sqrt(np.sum((p - q) ** 2)) for x, y in zip(a, b, strict=True) for p, q in zip(x, y, strict=True)]
     return sum(distances) / len(distances)
 
 
@@ -72,9 +70,7 @@ def test_speed_and_acceleration_against_a_loop(x64):
     motion = random(6, 6, 4, 3)
     first = [np.linalg.norm(motion[t + 1, k] - motion[t, k]) for t in range(5) for k in range(4)]
     second = [
-        np.linalg.norm(motion[t + 2, k] - 2 * motion[t + 1, k] + motion[t, k])
-        for t in range(4)
-        for k in range(4)
+        np.linalg.norm(motion[t + 2, k] - 2 * motion[t + 1, k] + motion[t, k]) for t in range(4) for k in range(4)
     ]
     np.testing.assert_allclose(metrics.speed(motion), np.mean(first), rtol=1e-14)
     np.testing.assert_allclose(metrics.acceleration(motion), np.mean(second), rtol=1e-14)
@@ -85,9 +81,7 @@ def test_laws_of_speed_and_acceleration(x64):
     np.testing.assert_allclose(metrics.acceleration(line), 0, atol=1e-13)
     np.testing.assert_allclose(metrics.speed(line), np.mean(np.linalg.norm(line[1], axis=-1)), rtol=1e-13)
     motion = random(8, 7, 4, 3)
-    np.testing.assert_allclose(
-        metrics.acceleration(3 * motion + line), 3 * metrics.acceleration(motion + line / 3)
-    )
+    np.testing.assert_allclose(metrics.acceleration(3 * motion + line), 3 * metrics.acceleration(motion + line / 3))
     noise = 0.1 * random(9, 2000, 4, 3)
     np.testing.assert_allclose(metrics.acceleration(noise), 0.39, rtol=0.02)
 

@@ -38,9 +38,7 @@ def batches(first, count):
 
 def fit(folder, total, **options):
     step = steps.supervised(loss, OPTIMISER)
-    return training.run(
-        step, start(), batches, folder, steps=total, constants=jnp.float32(0.5), chunk=4, **options
-    )
+    return training.run(step, start(), batches, folder, steps=total, constants=jnp.float32(0.5), chunk=4, **options)
 
 
 def numbers(state):
@@ -84,9 +82,7 @@ def test_a_run_in_pieces_gives_the_same_bits(tmp_path):
 
 def test_the_callers_state_survives_the_run(tmp_path):
     state = start()
-    training.run(
-        steps.supervised(loss, OPTIMISER), state, batches, tmp_path, steps=4, constants=jnp.float32(0)
-    )
+    training.run(steps.supervised(loss, OPTIMISER), state, batches, tmp_path, steps=4, constants=jnp.float32(0))
     np.testing.assert_array_equal(state.params["w"], np.ones((4, 2)))
 
 
@@ -141,10 +137,7 @@ def test_a_run_killed_at_odd_moments_resumes_to_the_same_bits(tmp_path):
     whole = fit(tmp_path / "whole", 120)
     random = np.random.default_rng(time.time_ns())  # the moments differ from run to run, the result may not
     for lines in (3, 14):
-        assert (
-            killed_after(tmp_path / "killed", lines, signal.SIGKILL, random.uniform(0, 0.05))
-            == -signal.SIGKILL
-        )
+        assert killed_after(tmp_path / "killed", lines, signal.SIGKILL, random.uniform(0, 0.05)) == -signal.SIGKILL
     assert 0 < len(entries(tmp_path / "killed")) < 30
     assert same(fit(tmp_path / "killed", 120), whole)
     assert entries(tmp_path / "killed") == entries(tmp_path / "whole")
@@ -180,9 +173,7 @@ def test_a_loss_gone_wrong_stops_with_step_term_and_checkpoint(tmp_path, at, val
         return state, {"fine": jnp.float32(1), "curse": jnp.where(state.step > at, value, 0.0)}
 
     with pytest.raises(training.TrainingError, match=message):
-        training.run(
-            cursed, start(), batches, tmp_path, steps=20, chunk=4, save_steps=4 if saved == "some" else None
-        )
+        training.run(cursed, start(), batches, tmp_path, steps=20, chunk=4, save_steps=4 if saved == "some" else None)
     assert all(entry["step"] <= at for entry in entries(tmp_path))
 
 
@@ -258,9 +249,7 @@ def test_an_adversarial_step_moves_the_critic_first_and_averages_the_generator()
 
     def generator_loss(g):
         played = zip(real[8:], condition[8:], strict=True)
-        return sum(
-            -jnp.tanh(g[c] @ critic[c]).sum() / 4 + 0.1 * jnp.abs(g[c] - x).sum() / 8 for x, c in played
-        )
+        return sum(-jnp.tanh(g[c] @ critic[c]).sum() / 4 + 0.1 * jnp.abs(g[c] - x).sum() / 8 for x, c in played)
 
     expected = -0.1 * jax.jit(jax.grad(generator_loss))(jnp.zeros((3, 2)))
     np.testing.assert_allclose(after.params.generator["g"], expected, rtol=1e-4, atol=1e-6)

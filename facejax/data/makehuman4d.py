@@ -1,10 +1,9 @@
 """makehuman4d: 4D expressions on MakeHuman heads, the dataset that everybody has.
 
 Version 1: 120 subjects (80 train, 20 validation, 20 test), 18 expressions each, neutral -> apex -> neutral, and for
-validation and test subjects the direct transitions between the expressions of OT23's Table 5. Four levels of realism
-(`facejax.data.rig`). Landmarks of every frame; meshes of a fixed draw of 20,000 frames. The same seed gives the same bytes
-on one machine. A later change of anything that alters a number is version 2.
-"""
+validation and test subjects the direct transitions between the expressions of OT23's Table 5. Four levels of
+realism (`facejax.data.rig`). Landmarks of every frame; meshes of a fixed draw of 20,000 frames. The same seed gives
+the same bytes on one machine. A later change of anything that alters a number is version 2."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Motions for Motion3DGAN, cut from a 4D dataset: displacements from neutral, unitless, 30 frames each.
 
-Unitless: divided by the centred Frobenius norm of the subject's neutral landmarks, which is returned so that figures can
-be given in millimetres. Halves are neutral -> peak (onset to the start of the apex) and peak -> neutral (end of the
-apex to offset), resampled uniformly in time; OT23, 4.1.
-"""
+Unitless: divided by the centred Frobenius norm of the subject's neutral landmarks, which is returned so that
+figures can be given in millimetres. Halves are neutral -> peak (onset to the start of the apex) and peak -> neutral
+(end of the apex to offset), resampled uniformly in time; OT23, 4.1."""
 
 from __future__ import annotations
 
@@ -58,9 +57,7 @@ def directs(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
     return _stack(rows)
 
 
-def interpolated(
-    onsets: Motions, labels: int, *, per_pair: int, reuse: int | None, frames: int = FRAMES
-) -> Motions:
+def interpolated(onsets: Motions, labels: int, *, per_pair: int, reuse: int | None, frames: int = FRAMES) -> Motions:
     """Peak -> peak transitions on the geodesics between onsets: the `per_pair` nearest to the prototypes.
 
     With `reuse`, no onset serves as the start, or as the end, of more than so many transitions of one pair.

@@ -1,9 +1,9 @@
 """Expressions performed: a label, a subject and a take give the weight of every unit over time.
 
-A recipe says what an expression is; a style says how this subject does it (one brow or both, left or right, stronger or
-weaker units); a take adds what differs from one try to the next. Time: neutral, a minimum-jerk onset, an apex held with a
-small tremor, a minimum-jerk offset, neutral. Every unit has its own lag, speed and overshoot, so that the path of the
-landmarks bends. Performed at 60 frames per second, 60 to 140 frames; handed out at 30.
+A recipe says what an expression is; a style says how this subject does it (one brow or both, left or right,
+stronger or weaker units); a take adds what differs from one try to the next. Time: neutral, a minimum-jerk onset,
+an apex held with a small tremor, a minimum-jerk offset, neutral. Every unit has its own lag, speed and overshoot,
+so that the path of the landmarks bends. Performed at 60 frames per second, 60 to 140 frames; handed out at 30.
 
 Randomness: the generator of a style is seeded with (seed, subject, label), that of a take with the take's number too.
 """
@@ -72,7 +72,13 @@ RECIPES = {
         extras=((0.5, {"mouthLowerDown*": 0.4}), (0.4, {"eyeSquint*": 0.6}), (0.3, {"jawOpen": 0.12})),
     ),
     "lips_back": Recipe(
-        {"mouthRollLower": 0.75, "mouthRollUpper": 0.45, "mouthDimple*": 0.6, "mouthPress*": 0.3, "mouthStretch*": 0.3},
+        {
+            "mouthRollLower": 0.75,
+            "mouthRollUpper": 0.45,
+            "mouthDimple*": 0.6,
+            "mouthPress*": 0.3,
+            "mouthStretch*": 0.3,
+        },
     ),
     "lips_up": Recipe(
         {"mouthUpperUp*": 0.9, "mouthShrugUpper": 0.9, "noseSneer*": 0.5, "mouth-elevation": 0.5},
@@ -83,7 +89,13 @@ RECIPES = {
         extras=((0.4, {"neck-platysma": 0.5}), (0.4, {"mouthShrugLower": 0.35}), (0.3, {"browDown*": 0.3})),
     ),
     "mouth_extreme": Recipe(
-        {"jawOpen": 0.7, "mouthStretch*": 0.8, "mouthLowerDown*": 0.5, "mouthUpperUp*": 0.5, "eyeSquint*": 0.5},
+        {
+            "jawOpen": 0.7,
+            "mouthStretch*": 0.8,
+            "mouthLowerDown*": 0.5,
+            "mouthUpperUp*": 0.5,
+            "eyeSquint*": 0.5,
+        },
         extras=((0.5, {"neck-platysma": 0.6}), (0.4, {"browOuterUp*": 0.5}), (0.3, {"noseSneer*": 0.5})),
     ),
     "mouth_middle": Recipe(
@@ -131,7 +143,12 @@ RECIPES = {
         extras=((0.4, {"mouthDimple*": 0.4}), (0.4, {"eyeSquint*": 0.3}), (0.3, {"browOuterUp*": 0.3})),
     ),
     "sadness": Recipe(
-        {"browInnerUp": 0.9, "eyebrows-left-inner-up": 0.8, "eyebrows-right-inner-up": 0.8, "mouthFrown*": 0.7},
+        {
+            "browInnerUp": 0.9,
+            "eyebrows-left-inner-up": 0.8,
+            "eyebrows-right-inner-up": 0.8,
+            "mouthFrown*": 0.7,
+        },
         extras=((0.6, {"mouthShrugLower": 0.5}), (0.5, {"eye-left-slit": 0.4, "eye-right-slit": 0.4})),
     ),
     "surprise": Recipe(
@@ -190,7 +207,7 @@ def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Perfor
     down = _activation(time, marks[2], fall, len(apex), rng)
     share = up * (1 - down)
     weights = apex * share * (1 + _tremor(time, len(apex), rng))
-    frames = [int(round(m * HANDED_OUT / RATE)) for m in marks]
+    frames = [round(m * HANDED_OUT / RATE) for m in marks]
     head = _lean(label, rng) * np.clip(share.mean(axis=1, keepdims=True), 0, None)
     return Performance(weights.astype(np.float32), head.astype(np.float32), *frames, duration=total / RATE)
 

@@ -1,9 +1,9 @@
 """What skin does where the face compresses it: furrows across the compression, and bulges of the flesh.
 
-A furrow group has, on the template, a mask, a coordinate s (millimetres across its furrows) and a profile: a wave for
-foreheads and crow's feet, a single fold for the nasolabial line. On a posed face the stretch along the gradient of s is
-measured triangle by triangle; where it is below 1 the profile is pushed out along the normal, deeper with age. Bulges
-follow the loss of area. Both depend on the face, its age and its pose alone, and vanish at rest.
+A furrow group has, on the template, a mask, a coordinate s (millimetres across its furrows) and a profile: a wave
+for foreheads and crow's feet, a single fold for the nasolabial line. On a posed face the stretch along the gradient
+of s is measured triangle by triangle; where it is below 1 the profile is pushed out along the normal, deeper with
+age. Bulges follow the loss of area. Both depend on the face, its age and its pose alone, and vanish at rest.
 
 Wavelengths follow the mesh: three edges at least (8 mm on the forehead, 3 mm about the eyes).
 """

@@ -69,6 +69,10 @@ class Store(NamedTuple):
         """The subject of each landmark row, (R,)."""
         return np.repeat([s.subject for s in self.sequences], [s.frames for s in self.sequences])
 
+    def row_labels(self) -> np.ndarray:
+        """The label of each landmark row, (R,) strings."""
+        return np.repeat([s.label for s in self.sequences], [s.frames for s in self.sequences])
+
     def meshes(self, split: str) -> tuple[np.ndarray, np.ndarray]:
         """Positions in `vertices` that belong to a split, and the subject of each."""
         owner = self.row_subjects()[self.drawn]

@@ -1,7 +1,7 @@
 """Eyes and teeth for a face that came without: the template's, fitted to its landmarks.
 
-They are for the eye alone: nothing is learnt from them or measured on them. iBUG's 68 landmarks are assumed; millimetres.
-"""
+They are for the eye alone: nothing is learnt from them or measured on them. iBUG's 68 landmarks are assumed;
+millimetres."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
     fit = _fit(template.landmarks, neutral, MOUTH, scaling=True)
     upper, lower = (np.asarray(align.apply(fit, teeth)) for teeth in (template.upper_teeth, template.lower_teeth))
     jaw = np.broadcast_to(neutral, landmarks.shape)
-    moving = np.asarray(align.apply(_fit(jaw, landmarks, JAW, scaling=False), np.broadcast_to(lower, (len(landmarks), *lower.shape))))
+    moving = np.asarray(
+        align.apply(_fit(jaw, landmarks, JAW, scaling=False), np.broadcast_to(lower, (len(landmarks), *lower.shape)))
+    )
     found.append(scene.Part(upper, template.upper_faces, props.TEETH, 0.6))
     found.append(scene.Part(moving, template.lower_faces, props.TEETH, 0.6))
     return tuple(found)

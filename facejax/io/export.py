@@ -73,9 +73,7 @@ def save(
         _write_arrays(path, shot)
     elif suffix in (".ply", ".obj"):
         if len(shot.vertices) > 1:
-            raise ValueError(
-                f"{path}: {suffix} holds one mesh, got {len(shot.vertices)} frames; end the path in '/'"
-            )
+            raise ValueError(f"{path}: {suffix} holds one mesh, got {len(shot.vertices)} frames; end the path in '/'")
         meshes.write(path, shot.vertices[0], shot.faces)
     else:
         known = ".glb .html .webp .gif .mp4 .png .npz .ply .obj, or a folder ending in '/'"
@@ -92,8 +90,7 @@ def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
     if colours is not None and np.ndim(colours) == 3:
         colours = np.asarray(colours)[chosen]
     extras = [
-        part._replace(vertices=part.vertices[chosen]) if part.vertices.ndim == 3 else part
-        for part in shot.extras
+        part._replace(vertices=part.vertices[chosen]) if part.vertices.ndim == 3 else part for part in shot.extras
     ]
     marks = None if shot.landmarks is None else shot.landmarks[chosen]
     still = shot._replace(vertices=shot.vertices[chosen], landmarks=marks, extras=extras)

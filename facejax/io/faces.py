@@ -1,9 +1,8 @@
 """A user's neutral face, brought to the model's topology, millimetres, y up and z forward.
 
 Accepted: a mesh of the model's own vertices, or a whole MakeHuman body (19,158 vertices with its helpers, 13,380
-without), as MakeHuman and Blender's MPFB export it. Units and the up axis are recognised by comparing the landmarks with
-the template's, and said aloud; the face stays where it is otherwise.
-"""
+without), as MakeHuman and Blender's MPFB export it. Units and the up axis are recognised by comparing the landmarks
+with the template's, and said aloud; the face stays where it is otherwise."""
 
 from __future__ import annotations
 
@@ -56,15 +55,11 @@ def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> 
         )
     bad = ~np.isfinite(vertices).all(axis=1)
     if bad.any():
-        raise meshes.MeshError(
-            f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}"
-        )
+        raise meshes.MeshError(f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}")
     turn = _axes(vertices[topology.landmark_index], topology.vertices[topology.landmark_index], name)
     if not np.array_equal(turn, np.eye(3)):
         vertices = vertices @ turn.T
-        notes.append(
-            f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"
-        )
+        notes.append(f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})")
     size = _spread(vertices[topology.landmark_index]) / _spread(topology.vertices[topology.landmark_index])
     for unit, millimetres in UNITS.items():
         if SIZE_RANGE[0] <= size * millimetres <= SIZE_RANGE[1]:

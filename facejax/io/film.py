@@ -50,9 +50,7 @@ def check(path: str | os.PathLike) -> str:
     if suffix not in FORMATS:
         raise ValueError(f"{path}: unknown film format {suffix!r}; expected {', '.join(FORMATS)}")
     if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ImportError(
-            f"{path}: MP4 needs imageio-ffmpeg: pip install 'facejax[video]'; .webp needs nothing"
-        )
+        raise ImportError(f"{path}: MP4 needs imageio-ffmpeg: pip install 'facejax[video]'; .webp needs nothing")
     return suffix
 
 

@@ -151,10 +151,7 @@ def _mesh(store: _Store, part: scene.Part, name: str, material: int, normals: bo
     mesh = {"name": name, "primitives": [primitive]}
     if len(frames) > 1:
         primitive["targets"] = [
-            {
-                key: store.accessor(column[t] - column[0], _VERTEX_DATA, sparse=sparse)
-                for key, column in columns.items()
-            }
+            {key: store.accessor(column[t] - column[0], _VERTEX_DATA, sparse=sparse) for key, column in columns.items()}
             for t in range(1, len(frames))
         ]
         mesh["weights"] = [0.0] * (len(frames) - 1)
@@ -182,10 +179,6 @@ def _glb(document: dict, data: bytes) -> bytes:
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + len(data)
     if size > 0xFFFFFFFF:
-        raise ValueError(
-            f"the animation takes {size} bytes; a GLB holds at most {0xFFFFFFFF}: write fewer frames"
-        )
-    chunks = (
-        struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
-    )
+        raise ValueError(f"the animation takes {size} bytes; a GLB holds at most {0xFFFFFFFF}: write fewer frames")
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
     return struct.pack("<III", 0x46546C67, 2, size) + chunks

@@ -226,9 +226,7 @@ def _checked(path: Path, vertices, faces) -> Mesh:
         raise MeshError(f"{path}: holds no vertices")
     bad = np.flatnonzero(~np.isfinite(vertices).all(1))
     if len(bad):
-        raise MeshError(
-            f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)"
-        )
+        raise MeshError(f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)")
     if faces is None or not len(faces):
         return Mesh(vertices, None)
     faces = np.asarray(faces)
@@ -236,9 +234,7 @@ def _checked(path: Path, vertices, faces) -> Mesh:
         raise MeshError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
     bad = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(1))
     if len(bad):
-        raise MeshError(
-            f"{path}: triangle {bad[0]} is {faces[bad[0]].tolist()}; vertices are 0..{len(vertices) - 1}"
-        )
+        raise MeshError(f"{path}: triangle {bad[0]} is {faces[bad[0]].tolist()}; vertices are 0..{len(vertices) - 1}")
     return Mesh(vertices, faces.astype(np.int32))
 
 

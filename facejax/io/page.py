@@ -90,9 +90,7 @@ def _fields(film: scene.Scene, title: str, colours) -> dict[str, str]:
         "distance": float(view.eye[2] - centre[2]),
         "zoom": view.zoom,
         "aspect": _ASPECT[0] / _ASPECT[1],
-        "light": [
-            (np.array(direction) / np.linalg.norm(direction)).tolist() for direction, _ in shade.LIGHTS
-        ],
+        "light": [(np.array(direction) / np.linalg.norm(direction)).tolist() for direction, _ in shade.LIGHTS],
         "tint": [colour for _, colour in shade.LIGHTS],
         "sky": shade.SKY,
         "ground": shade.GROUND,

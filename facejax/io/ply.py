@@ -61,9 +61,7 @@ def write(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
     table = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
     table["count"], table["corner"] = 3, faces
-    path.write_bytes(
-        "\n".join(header).encode() + vertices.astype(f"<{_TYPES[kind]}").tobytes() + table.tobytes()
-    )
+    path.write_bytes("\n".join(header).encode() + vertices.astype(f"<{_TYPES[kind]}").tobytes() + table.tobytes())
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:

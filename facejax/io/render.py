@@ -204,6 +204,4 @@ def _backdrop(colour, size, samples: int) -> np.ndarray:
     """A soft vertical fall-off, (height, width, 3) linear float32, counted in samples."""
     height = size[1] * samples
     fall = np.linspace(1.03, 0.86, height, dtype=np.float32)[:, None, None]
-    return np.broadcast_to(
-        shade.linear(np.asarray(colour, np.float32)) * fall, (height, size[0] * samples, 3)
-    )
+    return np.broadcast_to(shade.linear(np.asarray(colour, np.float32)) * fall, (height, size[0] * samples, 3))

@@ -125,9 +125,7 @@ def _landmarks(landmarks, vertices: np.ndarray) -> np.ndarray | None:
         return vertices[:, landmarks]
     landmarks = landmarks[None] if landmarks.ndim == 2 else landmarks
     if landmarks.ndim != 3 or landmarks.shape[-1] != 3 or len(landmarks) != len(vertices):
-        raise ValueError(
-            f"landmarks must be ({len(vertices)}, L, 3) or (L,) vertex indices, got {landmarks.shape}"
-        )
+        raise ValueError(f"landmarks must be ({len(vertices)}, L, 3) or (L,) vertex indices, got {landmarks.shape}")
     landmarks = landmarks.astype(np.float32)
     _finite(landmarks, "landmarks")
     return landmarks

@@ -73,9 +73,9 @@ def cavity(vertices: np.ndarray, normals: np.ndarray, neighbours) -> np.ndarray:
 
 def linear(colour: np.ndarray) -> np.ndarray:
     """sRGB to linear light."""
-    return np.where(
-        colour <= 0.04045, colour / 12.92, ((np.maximum(colour, 0) + 0.055) / 1.055) ** 2.4
-    ).astype(np.float32)
+    return np.where(colour <= 0.04045, colour / 12.92, ((np.maximum(colour, 0) + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )
 
 
 _GRID = np.linspace(0, 1, 4096)

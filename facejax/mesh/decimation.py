@@ -1,8 +1,8 @@
 """Coarser meshes on a subset of the vertices, and the way back up.
 
-`decimate` merges vertices by quadric edge collapse (Garland and Heckbert 1997, fast-simplification) and keeps of every
-merged group the member nearest to where the group came to lie. `upsampling` writes every fine vertex as a barycentric
-combination of three coarse ones.
+`decimate` merges vertices by quadric edge collapse (Garland and Heckbert 1997, fast-simplification) and
+keeps of every merged group the member nearest to where the group came to lie. `upsampling` writes every
+fine vertex as a barycentric combination of three coarse ones.
 """
 
 from __future__ import annotations
@@ -13,16 +13,15 @@ import numpy as np
 from facejax.mesh import graph
 
 
-def decimate(
-    vertices: np.ndarray, faces: np.ndarray, factor: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """About N / factor vertices: those kept (M,) ascending, faces (G, 3) over them, and each vertex's group (N,).
+def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """About N / factor vertices: those kept (M,), faces (G, 3) over them, and each vertex's group (N,).
 
     Raises `ValueError` when the mesh cannot be made that much coarser.
     """
     if factor <= 1:
         raise ValueError(f"factor: expected more than 1, got {factor}")
-    # The library's error thresholds are absolute: measured in edge lengths, the result does not depend on the unit.
+    # The library's error thresholds are absolute: measured in edge lengths, the result does not depend on
+    # the unit.
     pairs = graph.edges(faces)
     scaled = vertices / np.mean(np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1))
     _, _, collapses = fast_simplification.simplify(
@@ -44,13 +43,11 @@ def decimate(
     return kept.astype(np.int32), rank[coarse].astype(np.int32), rank[group].astype(np.int32)
 
 
-def upsampling(
-    vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest point on a coarse mesh.
 
-    Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some order. Exact: a
-    triangle is passed over only if its bounding sphere lies beyond a point already found.
+    Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some
+    order. Exact: a triangle is passed over only if its bounding sphere lies beyond a point already found.
     """
     triangles = coarse[faces]
     centre = triangles.mean(axis=1)
@@ -76,7 +73,8 @@ def upsampling(
 def closest_point(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Barycentric weights (P, 3) of the point of each triangle (P, 3, 3) closest to each point (P, 3).
 
-    The foot of the perpendicular where it falls inside; otherwise the best of the closest points of the three edges.
+    The foot of the perpendicular where it falls inside; otherwise the best of the closest points of the
+    three edges.
     """
     a, b, c = np.moveaxis(triangles, 1, 0)
     candidates = np.empty((4, len(points), 3))

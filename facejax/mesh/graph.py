@@ -36,8 +36,8 @@ def edges(faces: np.ndarray) -> np.ndarray:
 def rings(faces: np.ndarray, count: int) -> list[list[int]]:
     """The neighbours of each of `count` vertices in counter-clockwise order, read as a cycle.
 
-    A boundary vertex's open fan starts at its clockwise end, so that reading it as a cycle jumps across the boundary
-    and walks on from the other side. Several fans at one vertex follow one another.
+    A boundary vertex's open fan starts at its clockwise end, so that reading it as a cycle jumps across
+    the boundary and walks on from the other side. Several fans at one vertex follow one another.
     """
     following = [{} for _ in range(count)]
     for a, b, c in faces.tolist():
@@ -50,7 +50,7 @@ def rings(faces: np.ndarray, count: int) -> list[list[int]]:
 
 
 def _chain(following: dict[int, int | None]) -> list[int]:
-    """All keys of {neighbour: next neighbour}, each run from its start; a closed run starts at its smallest key."""
+    """All keys of {neighbour: next one}, run by run; a closed run starts at its smallest key."""
     starts = sorted(following.keys() - set(following.values())) + sorted(following)
     ordered = {}
     for vertex in starts:
@@ -77,5 +77,5 @@ def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple
 
 
 def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """Distance (N,) along edges to the nearest of the source vertices, in the vertices' unit; inf if unreachable."""
+    """Distance (N,) along edges to the nearest source vertex, in the vertices' unit; inf if unreachable."""
     return paths(np.asarray(vertices, np.float64), faces, sources)[0]

@@ -1,8 +1,9 @@
 """Spirals: a fixed order on every vertex's surroundings, so that one weight matrix fits all of them.
 
-A spiral is its centre, then ring after ring counter-clockwise (Lim et al. 2018; Bouritsas et al. 2019, Neural3DMM). The
-first neighbour is the one that a shortest path to a reference vertex would take, which makes the directions of
-neighbouring spirals agree. Tables are (N, S) int32; entry N is a dummy vertex that reads zero.
+A spiral is its centre, then ring after ring counter-clockwise (Lim et al. 2018; Bouritsas et al. 2019,
+Neural3DMM). The first neighbour is the one that a shortest path to a reference vertex would take, which
+makes the directions of neighbouring spirals agree. Tables are (N, S) int32; entry N is a dummy vertex
+that reads zero.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ def build(
 ) -> np.ndarray:
     """Spirals (N, S) of a mesh.
 
-    S is `length`, or int(mean + 2 std) of the number of vertices within `rings` rings; longer spirals are cut, shorter
-    ones padded with N. With a dilation of d, the centre and every d-th vertex after it are kept.
+    S is `length`, or int(mean + 2 std) of the number of vertices within `rings` rings; longer spirals are
+    cut, shorter ones padded with N. With a dilation of d, the centre and every d-th vertex after it are
+    kept.
     """
     if (length is not None and length < 1) or dilation < 1 or rings < 1:
         raise ValueError(f"expected length, dilation and rings of 1 or more, got {length}, {dilation}, {rings}")
@@ -42,8 +44,8 @@ def build(
 def starts(vertices: np.ndarray, faces: np.ndarray, around: list[list[int]], reference: int) -> np.ndarray:
     """Each vertex's first neighbour (N,): the predecessor on the shortest path from the reference.
 
-    A component that no path reaches takes its own vertex nearest to the reference as its reference. A reference has no
-    predecessor and takes its nearest neighbour.
+    A component that no path reaches takes its own vertex nearest to the reference as its reference. A
+    reference has no predecessor and takes its nearest neighbour.
     """
     if not 0 <= reference < len(vertices):
         raise ValueError(f"reference: expected a vertex in 0..{len(vertices) - 1}, got {reference}")
@@ -65,8 +67,8 @@ def _walk(
 ) -> list[int]:
     """Vertices of the spiral at `centre`, up to `count` vertices or all of the first `rings` rings.
 
-    Each vertex of a ring hands over its unseen neighbours, counter-clockwise from the one that it was reached from:
-    so the outer ring runs counter-clockwise too.
+    Each vertex of a ring hands over its unseen neighbours, counter-clockwise from the one that it was
+    reached from: so the outer ring runs counter-clockwise too.
     """
     seen = {centre: first}  # vertex: the neighbour where its own fan is entered
     ring = [centre]

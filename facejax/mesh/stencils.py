@@ -1,10 +1,10 @@
-"""Spirals as sparse maps: what every spiral position of every vertex reads, and the same table read backwards.
+"""Spirals as sparse maps: what every position of every spiral reads, and who reads every vertex.
 
-A spiral convolution on an upsampled signal is, per spiral position s, a sparse V x M matrix: row v holds the barycentric
-weights of the coarse vertices under the s-th vertex of v's spiral. Its product with dense rows is a sum of K gathers. The
-gradient needs the transpose, which would be a scatter. XLA's scatter on a CPU takes ten times longer per row than its
-gather, so a second table lists for every coarse vertex where it is read: as many slots as nine vertices in ten need,
-and a short remainder that is scattered.
+A spiral convolution on an upsampled signal is, per spiral position s, a sparse V x M matrix: row v holds
+the barycentric weights of the coarse vertices under the s-th vertex of v's spiral. Its product with dense
+rows is a sum of K gathers. The gradient needs the transpose, which would be a scatter. XLA's scatter on a
+CPU takes ten times longer per row than its gather, so a second table lists for every coarse vertex where
+it is read: as many slots as nine vertices in ten need, and a short remainder that is scattered.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ import numpy as np
 class Stencil(NamedTuple):
     """S sparse maps from M to V vertices. Unused slots have index 0 and weight 0.
 
-    The maps: out[v] = sum_k weight[s, k, v] x[source[s, k, v]].
-    Transposed: out[m] = sum_j back_weight[s, j, m] g[back[s, j, m]], plus rest_weight[s, r] g[rest_from[s, r]]
-    for every r with rest_to[s, r] = m.
+    The maps: out[v] = sum_k weight[s, k, v] x[source[s, k, v]]. Transposed: out[m] = sum_j back_weight[s,
+    j, m] g[back[s, j, m]], plus rest_weight[s, r] g[rest_from[s, r]] for every r with rest_to[s, r] = m.
     """
 
     source: np.ndarray  # (S, K, V) int32, below M
@@ -32,7 +31,9 @@ class Stencil(NamedTuple):
 
 
 def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
-    """The maps of spirals (V, S) on a signal that `corners` and `weights` (V, K) lift from `coarse` vertices."""
+    """The maps of spirals (V, S) on a signal that `corners` and `weights` (V, K) lift from `coarse`
+    vertices.
+    """
     count, length = spirals.shape
     real = spirals < count
     spirals = np.where(real, spirals, 0)

@@ -1,8 +1,9 @@
-"""The hierarchy that a mesh decoder climbs: coarser meshes, the way back up, and spirals, built once per template.
+"""The hierarchy that a mesh decoder climbs, built once per template.
 
-Levels run from fine (0, the template itself) to coarse. Every coarse vertex is one of the template's. All tables are
-numpy arrays, so that a hierarchy is a plain pytree: pass it to jitted functions as an argument, since tables that are
-closed over become constants that XLA spends seconds folding.
+Coarser meshes, the way back up, and spirals. Levels run from fine (0, the template itself) to coarse.
+Every coarse vertex is one of the template's. All tables are numpy arrays, so that a hierarchy is a plain
+pytree: pass it to jitted functions as an argument, since tables that are closed over become constants
+that XLA spends seconds folding.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax.mesh import decimation, graph, spirals
+from facejax.mesh import decimation, graph, spirals, stencils
+from facejax.mesh.stencils import Stencil
 
 FORMAT = 1  # raise it when the same template and options give other tables
 FACTORS = (4.0, 4.0, 4.0, 4.0)
 # Fine to coarse, as in the published sparse-to-dense decoder (Otberdout et al. 2023).
 LENGTHS = (15, 14, 9, 9)
+_STORED = ("kept", "faces", "spirals", "corners", "weights")
 
 
 class Hierarchy(NamedTuple):
@@ -31,8 +34,11 @@ class Hierarchy(NamedTuple):
     kept: tuple[np.ndarray, ...]  # n + 1 of (N_i,) int32: the level's vertices, as indices into the template
     faces: tuple[np.ndarray, ...]  # n + 1 of (F_i, 3) int32
     spirals: tuple[np.ndarray, ...]  # n of (N_i, S_i) int32; N_i marks the dummy vertex, which reads zero
-    corners: tuple[np.ndarray, ...]  # n of (N_i, 3) int32: vertices of level i + 1 under each vertex of level i
+    corners: tuple[np.ndarray, ...]  # n of (N_i, 3) int32: the vertices of level i + 1 under each vertex
     weights: tuple[np.ndarray, ...]  # n of (N_i, 3) float32: their barycentric weights, >= 0, sum 1
+    # What the tables above amount to, for `ops.spiral_conv`:
+    climbs: tuple[Stencil, ...]  # n: the spirals of level i on a signal of level i + 1
+    surface: Stencil  # the spirals of level 0 on a signal of level 0
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -52,10 +58,11 @@ def build(
 ) -> Hierarchy:
     """The hierarchy of a template (N, 3) with triangles (F, 3).
 
-    `factors` divide the number of vertices from level to level. `lengths` are the spiral lengths, one for all levels or
-    one per level but the coarsest; None takes int(mean + 2 std) of the two-ring sizes. `reference` is the vertex that
-    spirals start towards, by default the one with the largest z: the tip of the nose, in this project's frame. With a
-    folder `cache` the result is kept under the hash of everything that it depends on.
+    `factors` divide the number of vertices from level to level. `lengths` are the spiral lengths, one for
+    all levels or one per level but the coarsest; None takes int(mean + 2 std) of the two-ring sizes.
+    `reference` is the vertex that spirals start towards, by default the one with the largest z: the tip
+    of the nose, in this project's frame. With a folder `cache` the result is kept under the hash of
+    everything that it depends on.
 
     Raises `ValueError` for a broken mesh, options out of range, or a mesh too small for the factors.
     """
@@ -80,34 +87,39 @@ def build(
 
 
 def save(hierarchy: Hierarchy) -> dict[str, np.ndarray]:
-    """The tables by name (`spirals/0`), to be stored in any file of named arrays."""
-    return {f"{field}/{i}": t for field in hierarchy._fields for i, t in enumerate(getattr(hierarchy, field))}
+    """The tables by name (`spirals/0`), for any file of named arrays; `load` derives the stencils."""
+    return {f"{field}/{i}": table for field in _STORED for i, table in enumerate(getattr(hierarchy, field))}
 
 
 def load(arrays: Mapping[str, np.ndarray]) -> Hierarchy:
     """The hierarchy that `save` described. Raises `ValueError` for missing tables or ones that do not fit."""
     levels = sum(name.startswith("kept/") for name in arrays)
     counts = (levels, levels, *[levels - 1] * 3)
-    names = [
-        [f"{field}/{i}" for i in range(n)] for field, n in zip(Hierarchy._fields, counts, strict=True)
-    ]
+    names = [[f"{field}/{i}" for i in range(n)] for field, n in zip(_STORED, counts, strict=True)]
     expected = {name for group in names for name in group}
     if levels < 2 or expected != set(arrays):
         wrong = sorted(expected ^ set(arrays)) or ["kept/0"]
         raise ValueError(f"not the tables of a hierarchy: missing or unexpected {', '.join(wrong)}")
-    hierarchy = Hierarchy(*(tuple(np.asarray(arrays[name]) for name in group) for group in names))
-    sizes = hierarchy.sizes
+    kept, faces, tables, corners, weights = (tuple(np.asarray(arrays[name]) for name in group) for group in names)
+    sizes = [len(level) for level in kept]
     for i in range(levels - 1):
-        shapes = (hierarchy.spirals[i].shape[:1], hierarchy.corners[i].shape, hierarchy.weights[i].shape)
+        shapes = (tables[i].shape[:1], corners[i].shape, weights[i].shape)
         if shapes != ((sizes[i],), (sizes[i], 3), (sizes[i], 3)):
             raise ValueError(f"level {i}: expected tables for {sizes[i]} vertices, got shapes {shapes}")
-        if hierarchy.spirals[i].max() > sizes[i] or hierarchy.corners[i].max() >= sizes[i + 1]:
-            raise ValueError(f"level {i}: a table points past the last vertex")
-    return hierarchy
+        low, high = min(tables[i].min(), corners[i].min()), (tables[i].max(), corners[i].max())
+        if low < 0 or high[0] > sizes[i] or high[1] >= sizes[i + 1]:
+            raise ValueError(f"level {i}: a table points to a vertex that does not exist")
+    return _complete(kept, faces, tables, corners, weights)
 
 
 def _build(vertices, faces, factors, lengths, reference, dilation) -> Hierarchy:
-    kept, triangles, tables, corners, weights = [np.arange(len(vertices), dtype=np.int32)], [faces], [], [], []
+    kept, triangles, tables, corners, weights = (
+        [np.arange(len(vertices), dtype=np.int32)],
+        [faces],
+        [],
+        [],
+        [],
+    )
     origin = vertices[reference]
     for factor, length in zip(factors, lengths, strict=True):
         nearest = int(np.argmin(np.linalg.norm(vertices - origin, axis=1)))
@@ -119,7 +131,13 @@ def _build(vertices, faces, factors, lengths, reference, dilation) -> Hierarchy:
         vertices, faces = vertices[chosen], coarse
         kept.append(kept[-1][chosen])
         triangles.append(faces)
-    return Hierarchy(*map(tuple, (kept, triangles, tables, corners, weights)))
+    return _complete(*map(tuple, (kept, triangles, tables, corners, weights)))
+
+
+def _complete(kept, faces, tables, corners, weights) -> Hierarchy:
+    levels = zip(tables, corners, weights, kept[1:], strict=True)
+    climbs = tuple(stencils.build(*level, len(coarse)) for *level, coarse in levels)
+    return Hierarchy(kept, faces, tables, corners, weights, climbs, stencils.flat(tables[0]))
 
 
 def _read(path: Path) -> Hierarchy | None:

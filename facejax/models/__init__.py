@@ -1,0 +1,1 @@
+"""Models as `init` and `apply` pairs on plain pytrees."""

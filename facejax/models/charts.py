@@ -18,7 +18,6 @@ import numpy as np
 
 from facejax.geometry import sphere
 
-
 FEW = 8  # motions of a pair below which its own spread is not trusted
 
 
@@ -52,9 +51,7 @@ def fit(
     """
     shape = p.shape
     if p.ndim != 3 or tangents.shape[1:] != shape:
-        raise ValueError(
-            f"tangents must be (M, T-1, L, 3) at p (T-1, L, 3); got {tangents.shape} and {shape}"
-        )
+        raise ValueError(f"tangents must be (M, T-1, L, 3) at p (T-1, L, 3); got {tangents.shape} and {shape}")
     if len(tangents) <= rank:
         raise ValueError(f"rank {rank} needs more than {rank} motions; got {len(tangents)}")
     flat = np.asarray(tangents, np.float32).reshape(len(tangents), -1)

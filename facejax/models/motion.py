@@ -110,9 +110,7 @@ def _score(params: Params, values: jax.Array, start, end) -> jax.Array:
     # gradient along the narrow ones, which the penalty then fights.
     offset = (values[1:] - chart.mean[start, end]) / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
     hidden = jnp.concatenate([values[:1], offset, weights["labels"][0, start], weights["labels"][1, end]])
-    return _linear(
-        weights["head"], _residual_stack(weights, hidden, partial(jax.nn.leaky_relu, negative_slope=0.2))
-    )[0]
+    return _linear(weights["head"], _residual_stack(weights, hidden, partial(jax.nn.leaky_relu, negative_slope=0.2)))[0]
 
 
 @jax.jit

@@ -1,8 +1,8 @@
-"""Where a motion starts, when all that is known is the expression: a Gaussian over peaks, given how far the motion goes.
+"""Where a motion starts when only the expression is known: a Gaussian over peaks, given how far the motion goes.
 
-Motion3DGAN gives a motion from A to B, not the face that it starts from; OT23 names this as its limit (section 5). Taking
-A's mean peak is wrong where people differ: a mouth drawn to the left ends elsewhere than one drawn to the right. Let the
-peaks of A and B be independent Gaussians S and E. The motion's travel is d = E - S, and given d
+Motion3DGAN gives a motion from A to B, not the face that it starts from; OT23 names this as its limit (section 5).
+Taking A's mean peak is wrong where people differ: a mouth drawn to the left ends elsewhere than one drawn to the
+right. Let the peaks of A and B be independent Gaussians S and E. The motion's travel is d = E - S, and given d
 
     S | d  ~  N(m_A - C_A (C_A + C_B)^-1 (d - m_B + m_A),  C_A - C_A (C_A + C_B)^-1 C_A).
 

@@ -83,7 +83,10 @@ def test_interpolated_transitions_join_the_peaks(tiny_store):
     [
         (lambda path: (path / "index.json").unlink(), "index.json cannot be read"),
         (lambda path: (path / "landmarks.npy").write_bytes(b"x"), "landmarks.npy cannot be read"),
-        (lambda path: np.save(path / "drawn.npy", np.zeros(3, np.int64)), r"drawn.npy has shape \(3,\), expected \(60,\)"),
+        (
+            lambda path: np.save(path / "drawn.npy", np.zeros(3, np.int64)),
+            r"drawn.npy has shape \(3,\), expected \(60,\)",
+        ),
         (lambda path: (path / "index.json").write_text(json.dumps({"schema": 99})), "schema 99, expected 1"),
     ],
 )

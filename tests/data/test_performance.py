@@ -43,7 +43,11 @@ def test_styles_differ_between_subjects_but_not_between_calls():
     brows = np.stack([performance.peak("eyebrow", i) for i in range(40)])
     names = rig.unit_names()
     left, right = brows[:, names.index("browOuterUpLeft")], brows[:, names.index("browOuterUpRight")]
-    both, only_left, only_right = ((left > 0.3) & (right > 0.3)).sum(), (right < 0.3).sum(), (left < 0.3).sum()
+    both, only_left, only_right = (
+        ((left > 0.3) & (right > 0.3)).sum(),
+        (right < 0.3).sum(),
+        (left < 0.3).sum(),
+    )
     assert min(both, only_left, only_right) >= 4
     np.testing.assert_array_equal(performance.peak("eyebrow", 7), brows[7])
 

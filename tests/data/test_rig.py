@@ -60,9 +60,7 @@ def test_the_jaw_turns_about_its_hinge_by_an_angle_in_proportion_to_the_weight(r
 def test_full_jaw_opening_reaches_the_artists_target(rigs, subject):
     # Rotation and remainder together give the unit back at weight 1.
     target = assets.load().targets["arkit/jawOpen"]
-    np.testing.assert_allclose(
-        rig.pose(rigs[1], unit(jawOpen=1.0))[0], subject.neutral + target, atol=2e-3
-    )
+    np.testing.assert_allclose(rig.pose(rigs[1], unit(jawOpen=1.0))[0], subject.neutral + target, atol=2e-3)
 
 
 def test_saturation_is_odd_monotone_and_exact_at_one():

@@ -42,9 +42,7 @@ def test_normalise_is_undone_and_fixes_the_neutral(x64):
     curve, neutral = 40 * random(1, 6, 5, 3), 40 * random(2, 5, 3) + 7
     unitless, scale, centroid = align.normalise(curve, neutral)
     middle = sum(neutral) / 5
-    np.testing.assert_allclose(
-        scale, np.sqrt(sum(np.sum((row - middle) ** 2) for row in neutral)), rtol=1e-14
-    )
+    np.testing.assert_allclose(scale, np.sqrt(sum(np.sum((row - middle) ** 2) for row in neutral)), rtol=1e-14)
     np.testing.assert_allclose(unitless, (curve - middle) / float(scale), atol=1e-13)
     np.testing.assert_allclose(align.denormalise(unitless, scale, centroid), curve, atol=1e-12)
     own = align.normalise(neutral[None], neutral)[0]
@@ -137,9 +135,7 @@ def test_resample_to_the_same_frames_is_the_identity():
     curve = jnp.asarray(random(11, 6, 4, 3), jnp.float32)
     np.testing.assert_array_equal(align.resample(curve, frames=6), curve)
     np.testing.assert_array_equal(align.interpolate(curve, jnp.arange(6.0)), curve)
-    np.testing.assert_array_equal(
-        align.interpolate(curve, jnp.asarray([-3.0, 9.0])), curve[jnp.asarray([0, -1])]
-    )
+    np.testing.assert_array_equal(align.interpolate(curve, jnp.asarray([-3.0, 9.0])), curve[jnp.asarray([0, -1])])
 
 
 def test_resample_by_arc_against_a_loop_and_makes_the_speed_even(x64):

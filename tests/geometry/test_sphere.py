@@ -288,9 +288,7 @@ def test_karcher_mean_is_stationary_equivariant_and_a_midpoint(dtype):
     assert sphere.norm(jnp.mean(sphere.log(mean, qs), axis=0)) < 40 * EPS[dtype]
     turn = jnp.asarray(np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], dtype)
     np.testing.assert_allclose(sphere.karcher_mean(qs @ turn), mean @ turn, atol=100 * EPS[dtype])
-    np.testing.assert_allclose(
-        sphere.karcher_mean(qs[:2]), sphere.geodesic(qs[0], qs[1], 0.5), atol=100 * EPS[dtype]
-    )
+    np.testing.assert_allclose(sphere.karcher_mean(qs[:2]), sphere.geodesic(qs[0], qs[1], 0.5), atol=100 * EPS[dtype])
     np.testing.assert_allclose(sphere.karcher_mean(qs[:1]), qs[0], atol=4 * EPS[dtype])
 
 

@@ -48,9 +48,7 @@ def node():
         if shutil.which("node") is None:
             pytest.skip("Node is not installed")
         for package in packages:
-            found = subprocess.run(
-                ["node", "-e", f"require.resolve({package!r})"], cwd=ROOT, capture_output=True
-            )
+            found = subprocess.run(["node", "-e", f"require.resolve({package!r})"], cwd=ROOT, capture_output=True)
             if found.returncode:
                 pytest.skip(f"npm's {package} is not installed (npm install {package}, or set NODE_PATH)")
         command = ["node", str(Path(__file__).parent / script), json.dumps(argument)]

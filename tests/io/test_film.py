@@ -13,9 +13,7 @@ from facejax.io import film
 
 def _frames(count=5, height=24, width=32):
     rows = np.linspace(0, 255, height)[:, None] * np.ones(width)
-    return np.stack([np.stack([rows, rows * 0 + 40 * t, 255 - rows], -1) for t in range(count)]).astype(
-        np.uint8
-    )
+    return np.stack([np.stack([rows, rows * 0 + 40 * t, 255 - rows], -1) for t in range(count)]).astype(np.uint8)
 
 
 @pytest.mark.parametrize(("suffix", "unit", "error"), [(".webp", 1, 12), (".gif", 10, 30)])

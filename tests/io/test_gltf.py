@@ -33,9 +33,7 @@ def _values(document, binary, index) -> np.ndarray:
         return np.frombuffer(binary, kind, count, view["byteOffset"])
 
     if "bufferView" in record:
-        values = (
-            read(record["bufferView"], kind, record["count"] * columns).reshape(-1, columns).astype(float)
-        )
+        values = read(record["bufferView"], kind, record["count"] * columns).reshape(-1, columns).astype(float)
     else:
         values = np.zeros((record["count"], columns))
     if "sparse" in record:
@@ -43,9 +41,7 @@ def _values(document, binary, index) -> np.ndarray:
         index_kind, _ = kinds[sparse["indices"]["componentType"]]
         index = read(sparse["indices"]["bufferView"], index_kind, sparse["count"])
         assert (np.diff(index.astype(int)) > 0).all()
-        values[index] = read(sparse["values"]["bufferView"], kind, sparse["count"] * columns).reshape(
-            -1, columns
-        )
+        values[index] = read(sparse["values"]["bufferView"], kind, sparse["count"] * columns).reshape(-1, columns)
     np.testing.assert_array_equal(values.min(0), record["min"])
     np.testing.assert_array_equal(values.max(0), record["max"])
     return values

@@ -46,9 +46,7 @@ def test_npy_holds_vertices(tmp_path):
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_reads_what_trimesh_writes(tmp_path, encoding):
     mesh = trimesh.creation.icosphere(subdivisions=2)
-    (tmp_path / "ball.ply").write_bytes(
-        trimesh.exchange.ply.export_ply(mesh, encoding=encoding.split("_")[0])
-    )
+    (tmp_path / "ball.ply").write_bytes(trimesh.exchange.ply.export_ply(mesh, encoding=encoding.split("_")[0]))
     read = meshes.read(tmp_path / "ball.ply")
     np.testing.assert_allclose(read.vertices, mesh.vertices, rtol=1e-6, atol=1e-7)
     np.testing.assert_array_equal(read.faces, mesh.faces)
@@ -84,9 +82,7 @@ def _ply(order: str, polygons, extra: bool) -> bytes:
 
 
 @pytest.mark.parametrize("extra", [False, True])
-@pytest.mark.parametrize(
-    "polygons", [[[0, 1, 2, 3], [2, 3, 4]], [[0, 1, 2], [2, 3, 4]], [[0, 1, 2, 3, 4]], []]
-)
+@pytest.mark.parametrize("polygons", [[[0, 1, 2, 3], [2, 3, 4]], [[0, 1, 2], [2, 3, 4]], [[0, 1, 2, 3, 4]], []])
 @pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_ply_dialects(tmp_path, order, polygons, extra):
     path = tmp_path / "mesh.ply"
@@ -94,9 +90,7 @@ def test_ply_dialects(tmp_path, order, polygons, extra):
     mesh = meshes.read(path)
     np.testing.assert_array_equal(mesh.vertices, [[i, -i, i / 2] for i in range(5)])
     fans = [[p[0], p[i], p[i + 1]] for p in polygons for i in range(1, len(p) - 1)]
-    np.testing.assert_array_equal(
-        np.zeros((0, 3)) if mesh.faces is None else mesh.faces, np.reshape(fans, (-1, 3))
-    )
+    np.testing.assert_array_equal(np.zeros((0, 3)) if mesh.faces is None else mesh.faces, np.reshape(fans, (-1, 3)))
 
 
 def test_every_cut_of_a_ply_is_refused(tmp_path):

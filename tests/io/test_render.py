@@ -147,9 +147,7 @@ def test_an_eyeball_looks_where_it_is_told():
 
 def test_contact_sheet_and_caption(ball):
     picture = render.image(*ball, size=SIZE)
-    sheet = render.contact_sheet(
-        [[picture, picture], [picture]], ["a → b", "long row label"], ["1", "2" * 90], gap=4
-    )
+    sheet = render.contact_sheet([[picture, picture], [picture]], ["a → b", "long row label"], ["1", "2" * 90], gap=4)
     assert sheet.dtype == np.uint8
     bottom_left = sheet[-84:-4, -136:-72]
     np.testing.assert_array_equal(bottom_left, picture)

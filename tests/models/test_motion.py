@@ -198,9 +198,7 @@ def test_critic_gradient_along_the_tangent_is_the_one_in_coordinates(critic):
 
 
 def test_wrong_charts_and_noise_are_named(chart, generator):
-    with pytest.raises(
-        ValueError, match=r"basis must be \(128, 29, 68, 3\) for 19 labels; got \(8, 5, 4, 3\)"
-    ):
+    with pytest.raises(ValueError, match=r"basis must be \(128, 29, 68, 3\) for 19 labels; got \(8, 5, 4, 3\)"):
         motion.generator.init(jax.random.key(0), chart)
     with pytest.raises(ValueError, match=r"noise must have shape \(6,\); got \(7,\)"):
         motion.generator.apply(generator, jnp.zeros(7), 0, 1)
@@ -208,9 +206,7 @@ def test_wrong_charts_and_noise_are_named(chart, generator):
 
 def full_chart(labels: int) -> charts.Chart:
     f = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
-    return charts.Chart(
-        f(29, 68, 3), f(128, 29, 68, 3), f(128), f(labels, labels, 128), f(labels, labels), f(), f()
-    )
+    return charts.Chart(f(29, 68, 3), f(128, 29, 68, 3), f(128), f(labels, labels, 128), f(labels, labels), f(), f())
 
 
 def test_the_default_networks_count_under_two_million_numbers():
@@ -240,17 +236,13 @@ def test_reference_networks_run_narrow_with_tangent_output(chart):
     rng = np.random.default_rng(0)
 
     def made(network):  # plain random weights of the right shapes spare the compilation of every initialiser
-        shapes = jax.eval_shape(
-            lambda key: network.init(key, chart, config=config), jax.random.key(0)
-        ).weights
+        shapes = jax.eval_shape(lambda key: network.init(key, chart, config=config), jax.random.key(0)).weights
         fill = lambda leaf: 0.2 * rng.standard_normal(leaf.shape).astype(np.float32)  # noqa: E731
         return motion_reference.Params(chart, jax.tree.map(fill, shapes))
 
     generator, critic = made(motion_reference.generator), made(motion_reference.critic)
     noise = jax.random.normal(jax.random.key(2), (4, 6))
-    tangent, length = jax.vmap(motion_reference.generator.apply, (None, 0, None, None))(
-        generator, noise, 0, 1
-    )
+    tangent, length = jax.vmap(motion_reference.generator.apply, (None, 0, None, None))(generator, noise, 0, 1)
     assert tangent.shape == (4, *SHAPE) and length.shape == (4,)
     assert np.abs(sphere.inner(chart.p, tangent)).max() < 1e-6
     scores = jax.vmap(motion_reference.critic.apply, (None, 0, 0, None, None))(critic, tangent, length, 0, 1)

@@ -1,0 +1,173 @@
+"""Train the released models on makehuman4d: Motion3DGAN and S2D-Dec, apart, then put them into one file.
+
+    python -m experiments.pretrain --release
+
+Each stage keeps checkpoints in its folder and goes on from there when it was stopped; the two may run side by side
+(`--stage motion`, `--stage decoder`), and `--stage assemble --release` joins them into the package's
+`facejax/assets/makehuman4d.safetensors`, with the record of how it was made inside. About 40 minutes on 2 cores.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from experiments import _run
+from facejax import evaluation, fitting, pipeline
+from facejax.data import assets, cache, makehuman, makehuman4d, motions, store
+from facejax.data.meshes import of_split
+from facejax.io import dress
+from facejax.mesh import topology
+from facejax.models import decoder, starts
+
+PACKAGED = Path(pipeline.__file__).parent / "assets" / pipeline.RELEASED
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    out: Path = Path("runs/pretrain")
+    """Folder for checkpoints, metrics and the weights."""
+    seed: int = 0
+    """Of the initial weights, the order of the data and the noise."""
+    stage: Literal["all", "motion", "decoder", "assemble"] = "all"
+    """What to do; `assemble` needs the other two."""
+    level: int = 3
+    """Realism of the dataset."""
+    subjects: int = 120
+    """Of the dataset."""
+    meshes: int = 20_000
+    """Of the dataset."""
+    motion_steps: int = fitting.MotionPlan().steps
+    """Generator steps."""
+    decoder_steps: int = fitting.DecoderPlan().steps
+    """Decoder steps."""
+    release: bool = False
+    """Put the weights into the package."""
+    publish: bool = False
+    """Also write the record that the README quotes."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Train, assemble, measure."""
+    data = makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+    shape = makehuman.template()
+    hierarchy = topology.build(shape.vertices, shape.faces, cache=cache.folder())
+    parts = {}
+    if config.stage in ("all", "motion", "assemble"):
+        parts["motion"] = _motion(config, data)
+    if config.stage in ("all", "decoder", "assemble"):
+        parts["decoder"] = _decoder(config, data, hierarchy)
+    if config.stage in ("motion", "decoder"):
+        return {}
+    (generator, beginnings), motion_seconds = parts["motion"]
+    decode, decoder_seconds = parts["decoder"]
+    seconds = motion_seconds + decoder_seconds
+    made = _run.record(config, seconds=seconds, dataset=data.index["spec"])
+    models = pipeline.Models(
+        labels=data.labels,
+        face=pipeline.Face(
+            shape.vertices,
+            shape.faces,
+            shape.landmarks,
+            assets.load().source_index[: len(shape.vertices)],
+            shape.face_mask,
+        ),
+        props=_props(shape),
+        motion=generator,
+        starts=beginnings,
+        hierarchy=hierarchy,
+        decoder=decode,
+        about={
+            "made": made,
+            "plans": {"motion": _motion_plan(config)._asdict(), "decoder": _plan(config)._asdict()},
+        },
+    )
+    metrics = {
+        "error_mm": _errors(models, data),
+        "seconds": {"motion": motion_seconds, "decoder": decoder_seconds},
+    }
+    models = models._replace(about=models.about | metrics)
+    pipeline.save(config.out / pipeline.RELEASED, models)
+    if config.release:
+        pipeline.save(PACKAGED, models)
+    size = (config.out / pipeline.RELEASED).stat().st_size / 1e6
+    rows = [
+        ("S2D-Dec, mean vertex error on test subjects, whole head", f"{metrics['error_mm']['head']:.4f} mm"),
+        ("the same, face region", f"{metrics['error_mm']['face']:.4f} mm"),
+        ("Motion3DGAN, steps", config.motion_steps),
+        ("S2D-Dec, steps", config.decoder_steps),
+        ("weights", f"{size:.1f} MB"),
+    ]
+    _run.finish("pretrain", config, metrics, made=made, table=_run.markdown(("released models", ""), rows))
+    return metrics
+
+
+def _errors(models: pipeline.Models, data: store.Store) -> dict[str, float]:
+    hierarchy, mask = jax.device_put(models.hierarchy), np.asarray(models.face.mask)
+    found = evaluation.vertex_errors(
+        lambda marks: decoder.apply(models.decoder, hierarchy, marks),
+        of_split(data, "test"),
+        {"head": np.ones_like(mask), "face": mask},
+    )
+    return {region: row["mean_mm"] for region, row in found.items()}
+
+
+def _motion_plan(config: Config) -> fitting.MotionPlan:
+    return fitting.MotionPlan(steps=config.motion_steps)
+
+
+def _plan(config: Config) -> fitting.DecoderPlan:
+    return fitting.DecoderPlan(steps=config.decoder_steps)
+
+
+def _motion(config: Config, data: store.Store):
+    examples = fitting.transitions(data, "train")
+    folder = config.out / "motion"
+    with _timed(folder) as seconds:
+        generator = fitting.fit_motion(
+            examples, folder, labels=len(data.labels), plan=_motion_plan(config), seed=config.seed
+        )
+    halves = motions.halves(data, "train")
+    onsets = halves.take(halves.start == 0)
+    beginnings = starts.fit(onsets.curves[:, -1], onsets.end, classes=len(data.labels))
+    return (generator, beginnings), seconds()
+
+
+def _decoder(config: Config, data: store.Store, hierarchy):
+    folder = config.out / "decoder"
+    with _timed(folder) as seconds:
+        found = fitting.fit_decoder(of_split(data, "train"), hierarchy, folder, plan=_plan(config), seed=config.seed)
+    return found, seconds()
+
+
+class _timed:
+    """Seconds spent in a folder's run, over all its sittings."""
+
+    def __init__(self, folder: Path):
+        self.path = folder / "seconds.json"
+
+    def __enter__(self):
+        self.before = json.loads(self.path.read_text()) if self.path.exists() else 0.0
+        self.begun = time.perf_counter()
+        return lambda: json.loads(self.path.read_text())
+
+    def __exit__(self, *_: object) -> None:
+        spent = time.perf_counter() - self.begun
+        # A finished run that is only read again has added nothing worth counting.
+        _run.write_text(
+            self.path, json.dumps(round(self.before + (spent if spent > 30 or not self.before else 0.0), 1))
+        )
+
+
+def _props(shape: makehuman.Template) -> dress.Props:
+    return dress.Props(shape.vertices[shape.landmarks], *makehuman.template_props())
+
+
+if __name__ == "__main__":
+    _run.main("pretrain", Config, run)

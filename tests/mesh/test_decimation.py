@@ -1,0 +1,85 @@
+"""Decimation keeps true subsets; the closest point is the closest of densely sampled ones."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from facejax.mesh import decimation
+
+BALL = trimesh.creation.icosphere(subdivisions=3)  # 642 vertices
+
+
+def test_decimated_mesh_is_a_consistent_subset():
+    vertices, faces = np.asarray(BALL.vertices), np.asarray(BALL.faces)
+    kept, coarse, group = decimation.decimate(vertices, faces, 4)
+    assert 0.2 < len(kept) / len(vertices) < 0.3
+    assert (np.diff(kept) > 0).all()
+    np.testing.assert_array_equal(np.unique(coarse), np.arange(len(kept)))
+    np.testing.assert_array_equal(group[kept], np.arange(len(kept)))
+    mesh = trimesh.Trimesh(vertices[kept], coarse, process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.9 * BALL.volume
+    # A group lies about the vertex that stands for it.
+    assert np.linalg.norm(vertices - vertices[kept][group], axis=1).max() < 0.6
+
+
+def test_decimation_ignores_the_unit():
+    vertices, faces = np.asarray(BALL.vertices), np.asarray(BALL.faces)
+    small = decimation.decimate(vertices, faces, 4)
+    large = decimation.decimate(vertices * 1024, faces, 4)
+    for a, b in zip(small, large, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_impossible_factors():
+    tetrahedron = trimesh.creation.icosphere(subdivisions=0)
+    with pytest.raises(ValueError, match="more than 1"):
+        decimation.decimate(np.asarray(BALL.vertices), np.asarray(BALL.faces), 1)
+    with pytest.raises(ValueError, match="cannot be made"):
+        decimation.decimate(np.asarray(tetrahedron.vertices), np.asarray(tetrahedron.faces), 1000)
+
+
+def test_closest_point_against_dense_sampling():
+    rng = np.random.default_rng(0)
+    triangles, points = rng.normal(size=(40, 3, 3)), 2 * rng.normal(size=(40, 3))
+    found = decimation.closest_point(points, triangles)
+    assert found.min() >= 0 and np.allclose(found.sum(axis=1), 1)
+    distance = np.linalg.norm(np.einsum("pc,pcx->px", found, triangles) - points, axis=1)
+    u, v = np.meshgrid(np.linspace(0, 1, 101), np.linspace(0, 1, 101))
+    inside = u + v <= 1 + 1e-9
+    grid = np.stack([1 - u - v, u, v], axis=-1)[inside]
+    sampled = np.einsum("gc,pcx->pgx", grid, triangles)
+    best = np.linalg.norm(sampled - points[:, None], axis=2).min(axis=1)
+    assert (distance <= best + 1e-12).all() and (distance > best - 0.05).all()
+
+
+def test_closest_point_of_flattened_triangles_is_on_their_longest_edge():
+    line = np.array([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]], [[1.0, 1, 1], [1, 1, 1], [1, 1, 1]]])
+    found = decimation.closest_point(np.array([[2.0, 1, 0], [0, 0, 0]]), line)
+    np.testing.assert_allclose(np.einsum("pc,pcx->px", found, line), [[2, 0, 0], [1, 1, 1]], atol=1e-12)
+
+
+def test_upsampling_against_every_triangle():
+    rng = np.random.default_rng(1)
+    vertices, faces = np.asarray(BALL.vertices) + 0.05 * rng.normal(size=BALL.vertices.shape), BALL.faces
+    kept, coarse, _ = decimation.decimate(vertices, np.asarray(faces), 4)
+    corners, weights = decimation.upsampling(vertices, vertices[kept], coarse)
+    assert corners.dtype == np.int32 and weights.dtype == np.float32
+    assert weights.min() >= 0 and weights.max() <= 1
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=3e-7)
+    found = np.einsum("nc,ncx->nx", weights, vertices[kept][corners])
+    triangles = vertices[kept][coarse]
+    for vertex in range(0, len(vertices), 7):
+        points = np.repeat(vertices[vertex][None], len(triangles), axis=0)
+        every = decimation.closest_point(points, triangles)
+        best = np.linalg.norm(np.einsum("tc,tcx->tx", every, triangles) - points, axis=1).min()
+        assert np.linalg.norm(found[vertex] - vertices[vertex]) == pytest.approx(best, abs=1e-6)
+    np.testing.assert_array_equal(found[kept], vertices[kept])
+
+
+def test_upsampling_is_exact_for_affine_functions_of_a_flat_mesh():
+    y, x = np.divmod(np.arange(36), 6)
+    fine = np.stack([x, y, np.zeros(36)], axis=1).astype(float)
+    coarse = np.array([[0.0, 0, 0], [5, 0, 0], [5, 5, 0], [0, 5, 0]])
+    corners, weights = decimation.upsampling(fine, coarse, np.array([[0, 1, 2], [0, 2, 3]]))
+    affine = coarse @ [2.0, -3.0, 0] + 7
+    np.testing.assert_allclose(np.sum(weights * affine[corners], axis=1), fine @ [2.0, -3.0, 0] + 7, atol=1e-5)
