@@ -19,13 +19,17 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from PIL import Image
 
 from experiments import _run
-from facejax import files
-from facejax.data import makehuman, makehuman4d, performance, rig, store
+from facejax import evaluation, files
+from facejax.data import assets, contact, makehuman, makehuman4d, performance, rig, store
+from facejax.data.meshes import of_split
+from facejax.io import props, render, scene
 from facejax.models import linear
 
 matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
 
 SHOWN = (0, 3, 10, 22, 31)  # subjects on the contact sheet: women and men, 24 to 75 years old
 PICTURE = (150, 188)
