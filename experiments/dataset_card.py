@@ -29,7 +29,7 @@ from facejax.io import props, render, scene
 from facejax.models import linear
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 SHOWN = (0, 3, 10, 22, 31)  # subjects on the contact sheet: women and men, 24 to 75 years old
 PICTURE = (150, 188)

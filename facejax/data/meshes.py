@@ -5,8 +5,8 @@ N vertices, L landmarks, millimetres.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from facejax.data import store
 Batch = tuple[np.ndarray, np.ndarray]
 
 
-class Meshes(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Meshes:
     """Some of a dataset's meshes. Iterating gives (landmarks (n, L, 3), vertices (n, N, 3)), n <= size, in order."""
 
     data: store.Store
@@ -39,7 +40,7 @@ class Meshes(NamedTuple):
 
     def where(self, keep: np.ndarray) -> Meshes:
         """Those under a mask (G,)."""
-        return self._replace(at=self.at[keep], owner=self.owner[keep])
+        return dataclasses.replace(self, at=self.at[keep], owner=self.owner[keep])
 
     def of_labels(self, labels: Sequence[str], *, without: bool = False) -> Meshes:
         """Those of frames that show one of the labels, or none of them."""

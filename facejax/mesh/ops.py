@@ -4,13 +4,13 @@ V vertices out, M vertices in, B samples, C channels in, O channels out, S spira
 read per position. Signals are (V, B, C), the batch inside, so that one gathered row is B * C contiguous
 numbers.
 
-How the convolution came to be as it is (batch 16, 3,260 vertices, 2 cores; CPU ms of the decoder, forward
-/ gradient): gathering (V, S * C) blocks and multiplying them 340 / 342; multiplying first, per position,
-and gathering sums 14 / 64. Upsampling and multiplication commute, so the product is taken on the coarse
-side: a quarter of the arithmetic. The transposed gather of the finest upsampling takes 19 ms as a
-scatter, 5 ms by inverse lists. Written out position by position, XLA fuses the producer of the gradient
-into each of some 300 gathers (387 ms, 36 s to compile); a scan keeps it in memory and compiles in a
-second or two.
+How the convolution came to be as it is (batch 16, 3,260 vertices, one core of a Xeon; ms of the decoder,
+forward / gradient): gathering (V, S * C) blocks and multiplying them 340 / 342; multiplying first, per
+position, and gathering sums 14 / 60. Upsampling and multiplication commute, so the product is taken on
+the coarse side: a quarter of the arithmetic. The transposed gather of the finest upsampling takes 19 ms
+as a scatter, 5 ms by inverse lists. Written out position by position, XLA fuses the producer of the
+gradient into each of some 300 gathers (387 ms, 36 s to compile); a scan keeps it in memory and compiles
+in a second or two.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
     summed = _sum_positions(
         lambda weight: (rows @ weight).reshape(count, batch * out_channels), kernel, stencil, axis=0
     )
-    return summed.reshape(-1, batch, out_channels)
+    return summed.reshape(stencil.source.shape[2], batch, out_channels)
 
 
 @jax.jit
@@ -132,7 +132,7 @@ def _transpose(cotangent, _, *tables, axis, transposed):
 
 def _batch(arguments, axes, **options):
     x, *tables = arguments
-    if any(a is not batching.not_mapped for a in axes[1:]):
+    if any(a is not None for a in axes[1:]):
         raise ValueError("vmap over the tables of a hierarchy: expected one hierarchy for the whole batch")
     x = jnp.moveaxis(x, axes[0], -1)
     return _stencil_p.bind(x, *tables, **options), x.ndim - 1

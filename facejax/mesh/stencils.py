@@ -17,8 +17,10 @@ import numpy as np
 class Stencil(NamedTuple):
     """S sparse maps from M to V vertices. Unused slots have index 0 and weight 0.
 
-    The maps: out[v] = sum_k weight[s, k, v] x[source[s, k, v]]. Transposed: out[m] = sum_j back_weight[s,
-    j, m] g[back[s, j, m]], plus rest_weight[s, r] g[rest_from[s, r]] for every r with rest_to[s, r] = m.
+    The map: out[v] = sum_k weight[s, k, v] x[source[s, k, v]].
+
+    Transposed: out[m] = sum_j back_weight[s, j, m] g[back[s, j, m]], and rest_weight[s, r] g[rest_from[s,
+    r]] for every r with rest_to[s, r] = m.
     """
 
     source: np.ndarray  # (S, K, V) int32, below M
@@ -31,9 +33,7 @@ class Stencil(NamedTuple):
 
 
 def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
-    """The maps of spirals (V, S) on a signal that `corners` and `weights` (V, K) lift from `coarse`
-    vertices.
-    """
+    """The maps of spirals (V, S) on a signal lifted by corners and weights (V, K) from `coarse` vertices."""
     count, length = spirals.shape
     real = spirals < count
     spirals = np.where(real, spirals, 0)

@@ -72,6 +72,8 @@ def build(
     if len(factors) == 0 or len(lengths) != len(factors):
         raise ValueError(f"expected one length per factor, got {len(lengths)} and {len(factors)}")
     reference = int(np.argmax(vertices[:, 2])) if reference is None else reference
+    if not 0 <= reference < len(vertices):
+        raise ValueError(f"reference: expected a vertex in 0..{len(vertices) - 1}, got {reference}")
     options = (FORMAT, [float(factor) for factor in factors], list(lengths), reference, dilation)
     path = None
     if cache is not None:
@@ -143,7 +145,8 @@ def _complete(kept, faces, tables, corners, weights) -> Hierarchy:
 def _read(path: Path) -> Hierarchy | None:
     """A cached hierarchy; None where there is none or the file is damaged, so that it is built anew."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        # Opened here, because np.load leaves a file that it cannot read open.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return load(dict(arrays))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return None

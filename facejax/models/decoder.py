@@ -117,8 +117,10 @@ def _decode(params: Params, hierarchy: Hierarchy, displacements: jax.Array) -> j
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = (displacements - scale.landmark_mean.reshape(-1)) / scale.landmark_std
     x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
-    x = x.reshape(len(x), hierarchy.sizes[-1], -1).transpose(1, 0, 2)  # the batch inside, as `ops` wants it
     *climbs, last = weights["convs"]
+    channels = climbs[0]["kernel"].shape[1]
+    # The batch inside, as `ops` wants it.
+    x = x.reshape(len(x), hierarchy.sizes[-1], channels).transpose(1, 0, 2)
     for conv, stencil in zip(climbs, hierarchy.climbs[::-1], strict=True):
         x = jax.nn.elu(ops.spiral_conv(x, conv["kernel"], stencil) + conv["bias"])
     x = ops.spiral_conv(x, last["kernel"], hierarchy.surface) + last["bias"]

@@ -104,7 +104,7 @@ def test_wrong_tables_are_named(hierarchy):
     with pytest.raises(ValueError, match="level 0: expected tables for 642"):
         topology.load(arrays | {"corners/0": arrays["corners/0"][1:]})
     with pytest.raises(ValueError, match="level 1: a table points"):
-        topology.load(arrays | {"spirals/1": arrays["spirals/1"] + 1})
+        topology.load(arrays | {"spirals/1": arrays["spirals/1"] + 2})
 
 
 def test_cache_returns_the_same_and_survives_damage(hierarchy, tmp_path, monkeypatch):

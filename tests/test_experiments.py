@@ -1,0 +1,64 @@
+"""Every experiment runs on a tiny configuration, and writes what it promises."""
+
+import json
+
+import pytest
+
+from experiments import classification, dataset_card, motion_quality, pretrain, unseen_subjects
+
+TINY = {"subjects": 6, "meshes": 260}
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """Tiny datasets must not land in the user's cache; the assets are already loaded."""
+    from facejax.data import assets
+
+    assets.load()
+    monkeypatch.setenv("FACEJAX_CACHE", str(tmp_path / "cache"))
+
+
+def check(out, *fields):
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert set(fields) <= set(metrics)
+    assert {"command", "commit", "machine", "seed", "seconds", "dataset"} <= set(metrics["made"])
+    assert (out / "config.json").exists() and "|" in (out / "table.md").read_text()
+    return metrics
+
+
+def test_dataset_card(own_cache, tmp_path):
+    dataset_card.run(dataset_card.Config(out=tmp_path / "o", levels=(0,), **TINY))
+    metrics = check(tmp_path / "o", "levels", "speed_mm_per_s")
+    errors = metrics["levels"]["0"]["error_mm"]["subjects"]
+    assert errors["ridge"]["head"] < 0.1 * metrics["levels"]["0"]["motion_mm"]["head"]
+    assert {p.name for p in (tmp_path / "o").glob("*.png")} == {"dataset_card.png", "expressions.png", "levels.png"}
+
+
+def test_unseen_subjects(own_cache, tmp_path):
+    unseen_subjects.run(unseen_subjects.Config(out=tmp_path / "o", levels=(1,), steps=3, **TINY))
+    rows = check(tmp_path / "o", "rows")["rows"]
+    assert {(r["method"], r["region"]) for r in rows} == {
+        (m, r) for m in ("ridge", "pca220", "s2d") for r in ("head", "face")
+    }
+    assert all(r["mean_mm"] > 0 for r in rows)
+
+
+def test_pretrain(own_cache, tmp_path):
+    config = pretrain.Config(out=tmp_path / "o", level=1, motion_steps=2, decoder_steps=2, **TINY)
+    pretrain.run(config)
+    metrics = check(tmp_path / "o", "error_mm", "seconds")
+    assert metrics["error_mm"]["face"] > 0
+    assert (tmp_path / "o" / "makehuman4d.safetensors").stat().st_size < 25e6
+
+
+@pytest.mark.slow
+def test_classification(tmp_path):
+    classification.run(classification.Config(out=tmp_path / "o", samples=2, trees=20))
+    metrics = check(tmp_path / "o", "accuracy_generated", "accuracy_real", "accuracy_direct")
+    assert metrics["accuracy_real"] > 0.9
+
+
+@pytest.mark.slow
+def test_motion_quality(tmp_path):
+    motion_quality.run(motion_quality.Config(out=tmp_path / "o", samples=4))
+    check(tmp_path / "o", "amplitude_ratio", "acceleration_ratio", "diversity_ratio")

@@ -1,0 +1,86 @@
+"""Training composed, on a tiny dataset and for a few steps: it runs, learns, resumes, and feeds the pipeline."""
+
+import jax
+import numpy as np
+import pytest
+
+from facejax import evaluation, fitting
+from facejax.data import makehuman
+from facejax.data.meshes import of_split
+from facejax.mesh import topology
+from facejax.models import decoder, linear, motion
+
+
+@pytest.fixture(scope="module")
+def hierarchy(template):
+    return topology.build(template.vertices, template.faces)
+
+
+@pytest.fixture(scope="module")
+def regions():
+    mask = makehuman.template().face_mask
+    return {"head": np.ones_like(mask), "face": mask}
+
+
+def test_meshes_batch_select_and_fold(tiny_store):
+    train = of_split(tiny_store, "train", size=7)
+    sizes = [len(marks) for marks, _ in train]
+    assert sum(sizes) == train.count and max(sizes) == 7
+    marks, vertices = train.read(np.array([0, 3]))
+    np.testing.assert_array_equal(vertices[:, tiny_store.landmark_index], marks)
+    some = train.of_labels(["anger", "fear"])
+    assert some.count + train.of_labels(["anger", "fear"], without=True).count == train.count
+    for fit_on, held_out in train.folds(2):
+        assert not set(fit_on.owner) & set(held_out.owner)
+        assert fit_on.count + held_out.count == train.count
+
+
+def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store, hierarchy, regions, tmp_path):
+    train = of_split(tiny_store, "train")
+    plan = fitting.DecoderPlan(steps=60, batch=8, rate=2e-3)
+    whole = fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan)
+    again = fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+    def mean(params):
+        found = evaluation.vertex_errors(lambda m: decoder.apply(params, hierarchy, m), train, regions)
+        return found["face"]["mean_mm"]
+
+    untrained = decoder.init(jax.random.key(0), hierarchy, scale=whole.scale)
+    assert mean(whole) < 0.85 * mean(untrained)
+
+
+def test_generator_trains_on_the_data(tiny_store, tmp_path):
+    examples = fitting.transitions(tiny_store, "train", per_pair=2)
+    assert len(examples.curves) == 4 * 18 * 2 + 18 * 17 * 2
+    config = motion.Config(rank=16, width=32, blocks=1, noise=16, embedding=4)
+    plan = fitting.MotionPlan(steps=4, batch=16, critic_steps=2, reconstruction=1.0, length=0.1)
+    params = fitting.fit_motion(examples, tmp_path, labels=19, plan=plan, config=config)
+    q, log_length = motion.sample(params, jax.random.key(0), 0, 4)
+    assert q.shape == (29, 68, 3) and np.isfinite(q).all() and np.isfinite(log_length)
+    assert (tmp_path / "metrics.jsonl").read_text().count("reconstruction") == 1
+
+
+def test_vertex_errors_are_those_of_the_plain_loop(tiny_store, regions):
+    test = of_split(tiny_store, "test", size=3)
+    shift = np.array([0.3, -0.4, 0.0])
+    found = evaluation.vertex_errors(lambda marks: np.concatenate([v for _, v in test])[: len(marks)], test, regions)
+    batches = [v for _, v in test]
+    first = np.concatenate(batches)
+    distance = np.concatenate([np.linalg.norm(first[: len(b)] - b, axis=-1) for b in batches])
+    for name, mask in regions.items():
+        assert found[name]["mean_mm"] == pytest.approx(distance[:, mask].mean(), rel=1e-6)
+        assert found[name]["std_mm"] == pytest.approx(distance[:, mask].std(), rel=1e-5)
+    truth = iter([v for _, v in test])
+    moved = evaluation.vertex_errors(lambda marks: next(truth) + shift, test, regions)
+    assert moved["head"]["mean_mm"] == pytest.approx(0.5, rel=1e-5)
+
+
+def test_ridge_beats_no_motion_on_unseen_people(tiny_store, regions):
+    train, test = of_split(tiny_store, "train"), of_split(tiny_store, "test")
+    params, alpha = evaluation.fit_linear(linear.ridge, train)
+    assert alpha in evaluation.ALPHAS
+    mean = evaluation.vertex_errors(lambda m: linear.apply(params, m), test, regions)["head"]["mean_mm"]
+    still = evaluation.vertex_errors(lambda m: np.zeros((len(m), 3260, 3)), test, regions)["head"]["mean_mm"]
+    assert mean < 0.5 * still

@@ -1,0 +1,126 @@
+"""The released models, from labels to meshes."""
+
+import jax
+import numpy as np
+import pytest
+
+from facejax import pipeline, weights
+from facejax.data import makehuman, performance
+
+
+@pytest.fixture(scope="module")
+def models():
+    return pipeline.load()
+
+
+@pytest.fixture(scope="module")
+def person():
+    return makehuman.subject(103)
+
+
+KEY = jax.random.key(7)
+
+
+def test_released_models_describe_themselves(models):
+    assert models.labels == performance.LABELS
+    assert models.about["made"]["command"].startswith("python -m experiments.pretrain")
+    assert models.about["made"]["dataset"]["level"] == 3
+    assert len(models.face.vertices) == 3260 and models.face.landmark_index.shape == (68,)
+
+
+def test_landmarks_start_at_the_face_and_come_home(models, person):
+    rest = person.vertices[np.asarray(models.face.landmark_index)]
+    moved = pipeline.landmarks(models, KEY, ["neutral", "high_smile", "mouth_open", "neutral"], person.vertices)
+    assert moved.shape == (1 + 3 * 29, 68, 3)
+    np.testing.assert_allclose(moved[0], rest, atol=1e-4)
+    np.testing.assert_allclose(moved[-1], rest, atol=1e-3)
+    distance = np.linalg.norm(np.asarray(moved) - rest, axis=-1).mean(axis=-1)
+    assert distance[29] > 1.0 and distance[58] > 2.0
+    # No jump at a joint: the largest step is nowhere much larger than its neighbours' size allows.
+    steps = np.linalg.norm(np.diff(moved, axis=0), axis=-1).max(axis=-1)
+    assert steps[[28, 29, 57, 58]].max() < 0.8 * steps.max() + 0.5
+
+
+def test_meshes_carry_the_landmarks_and_hold_still_at_rest(models, person):
+    moved = pipeline.landmarks(models, KEY, ["neutral", "surprise"], person.vertices)
+    vertices = np.asarray(pipeline.meshes(models, moved, person.vertices))
+    assert vertices.shape == (30, 3260, 3)
+    np.testing.assert_allclose(vertices[0], person.vertices, atol=0.5)
+    carried = vertices[:, np.asarray(models.face.landmark_index)]
+    assert np.linalg.norm(carried - np.asarray(moved), axis=-1).mean() < 0.6
+    back = np.linalg.norm(vertices[-1] - person.vertices, axis=-1)
+    assert back[np.asarray(models.face.mask)].mean() > 3 * back[~np.asarray(models.face.mask)].mean()
+
+
+def test_same_key_same_motion_and_samples_differ(models, person):
+    one, again = (pipeline.landmarks(models, KEY, ["neutral", "anger"], person.vertices) for _ in range(2))
+    np.testing.assert_array_equal(one, again)
+    drawn = np.asarray(pipeline.landmarks(models, KEY, ["neutral", "anger"], person.vertices, samples=4))
+    assert drawn.shape == (4, 30, 68, 3)
+    apart = [np.abs(a - b).max() for i, a in enumerate(drawn) for b in drawn[:i]]
+    assert min(apart) > 0.3
+
+
+def test_motion_scales_with_intensity_and_with_the_face(models, person):
+    rest = person.vertices[np.asarray(models.face.landmark_index)]
+    once, twice, none = (
+        np.asarray(pipeline.landmarks(models, KEY, ["neutral", "fear"], person.vertices, intensity=i)) - rest
+        for i in (1.0, 2.0, 0.0)
+    )
+    np.testing.assert_allclose(twice, 2 * once, atol=1e-3)
+    np.testing.assert_allclose(none, 0, atol=1e-4)
+    larger = np.asarray(pipeline.landmarks(models, KEY, ["neutral", "fear"], 1.5 * person.vertices)) - 1.5 * rest
+    np.testing.assert_allclose(larger, 1.5 * once, atol=1e-3)
+
+
+def test_frames_and_a_start_at_a_peak(models, person):
+    rest = person.vertices[np.asarray(models.face.landmark_index)]
+    moved = np.asarray(pipeline.landmarks(models, KEY, ["mouth_open", "neutral"], person.vertices, frames=12))
+    assert moved.shape == (12, 68, 3)
+    assert np.linalg.norm(moved[0] - rest, axis=-1).mean() > 2.0
+    np.testing.assert_allclose(moved[-1], rest, atol=1e-3)
+
+
+def test_captions_follow_the_joints():
+    assert pipeline.captions(["a", "b", "c"], frames=30) == ((0, "a → b"), (29, "b → c"))
+
+
+@pytest.mark.parametrize(
+    ("labels", "options", "message"),
+    [
+        (["neutral", "high_smlie"], {}, "unknown label 'high_smlie': did you mean high_smile"),
+        (["neutral", "qqqq"], {}, "there are neutral, bareteeth"),
+        (["neutral"], {}, "a start and an end"),
+        (["neutral", "anger"], {"frames": 1}, "2 or more"),
+        (["neutral", "anger"], {"samples": 0}, "1 or more"),
+        (["neutral", "anger"], {"intensity": 2.5}, r"0\.\.2, got 2.5"),
+    ],
+)
+def test_bad_requests_are_named(models, person, labels, options, message):
+    with pytest.raises(ValueError, match=message):
+        pipeline.landmarks(models, KEY, labels, person.vertices, **options)
+
+
+def test_wrong_shapes_are_named(models, person):
+    with pytest.raises(ValueError, match=r"expected vertices \(3260, 3\).*got \(10, 3\)"):
+        pipeline.landmarks(models, KEY, ["neutral", "anger"], np.zeros((10, 3)))
+    with pytest.raises(ValueError, match=r"landmarks: expected \(..., 68, 3\)"):
+        pipeline.meshes(models, np.zeros((5, 51, 3)), person.vertices)
+
+
+def test_saved_models_load_the_same(models, person, tmp_path):
+    path = tmp_path / "models.safetensors"
+    pipeline.save(path, models)
+    again = pipeline.load(path)
+    for a, b in zip(jax.tree.leaves(models[1:7]), jax.tree.leaves(again[1:7]), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert path.stat().st_size < 25e6
+
+
+def test_files_that_hold_no_models_are_named(tmp_path):
+    path = tmp_path / "other.safetensors"
+    weights.save(path, {"a": np.zeros(3, np.float32)}, metadata={"shapes": {"a": ["float32", [3]]}})
+    with pytest.raises(weights.WeightsError, match="does not describe facejax models"):
+        pipeline.load(path)
+    with pytest.raises(weights.WeightsError, match="no weights file"):
+        pipeline.load(tmp_path / "none.safetensors")
