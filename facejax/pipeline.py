@@ -24,7 +24,6 @@ from facejax import weights
 from facejax.geometry import align, srvf
 from facejax.io import dress
 from facejax.mesh import topology
-from facejax.mesh.stencils import Stencil
 from facejax.models import charts, decoder, motion, starts
 
 RATE = 30.0  # frames per second of the motions that the generator learnt
@@ -63,6 +62,10 @@ def load(path: str | os.PathLike | None = None) -> Models:
     except (KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
     tree, about = weights.load(path, like)
+    try:
+        tree["hierarchy"] = topology.load(tree["hierarchy"])
+    except ValueError as error:
+        raise weights.WeightsError(f"{path}: {error}") from error
     # The face and its props stay on the host: they are read by exporters, not by networks.
     moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in ("motion", "starts", "hierarchy", "decoder")}
     return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
@@ -72,6 +75,7 @@ def save(path: str | os.PathLike, models: Models) -> None:
     """Write models to one safetensors file; `about` gains what `load` needs."""
     tree = models._asdict()
     about = tree.pop("about") | {"labels": list(tree.pop("labels"))}
+    tree["hierarchy"] = topology.save(models.hierarchy)
     leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
     weights.save(path, tree, metadata=about | {"shapes": leaves})
 
@@ -201,10 +205,7 @@ def _structure(shapes: dict[str, list]) -> dict[str, Any]:
         for step in path:
             inner = inner.setdefault(step, {})
         inner[last] = jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
-    tables = nested["hierarchy"]
-    climbs = [Stencil(**row) for row in _listed(tables.pop("climbs"))]
-    surface = Stencil(**tables.pop("surface"))
-    levels = {name: tuple(_listed(rows)) for name, rows in tables.items()}
+    tables = {f"{table}/{i}": leaf for table, rows in nested["hierarchy"].items() for i, leaf in rows.items()}
     networks = {}
     for name in ("motion", "decoder"):
         weights = nested[name]["weights"]
@@ -214,7 +215,7 @@ def _structure(shapes: dict[str, list]) -> dict[str, Any]:
         "props": dress.Props(**nested["props"]),
         "motion": motion.Params(charts.Chart(**nested["motion"]["chart"]), networks["motion"]),
         "starts": starts.Params(**nested["starts"]),
-        "hierarchy": topology.Hierarchy(climbs=tuple(climbs), surface=surface, **levels),
+        "hierarchy": tables,
         "decoder": decoder.Params(decoder.Scale(**nested["decoder"]["scale"]), networks["decoder"]),
     }
 

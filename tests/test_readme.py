@@ -1,4 +1,4 @@
-"""The README is true: its Python runs, its commands exist, its files are there, its figures are those of the results."""
+"""The README is true: its Python runs, its commands parse, its links lead somewhere, its tables are the results."""
 
 import json
 import re
