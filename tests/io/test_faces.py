@@ -23,9 +23,7 @@ def test_a_plain_face_comes_back_as_it_is(topology, person):
     assert found.notes == ()
 
 
-@pytest.mark.parametrize(
-    ("unit", "millimetres"), [("centimetres", 10.0), ("decimetres", 100.0), ("metres", 1000.0)]
-)
+@pytest.mark.parametrize(("unit", "millimetres"), [("centimetres", 10.0), ("decimetres", 100.0), ("metres", 1000.0)])
 def test_units_are_recognised_and_said(topology, person, unit, millimetres):
     found = faces.fit(person / millimetres, topology)
     np.testing.assert_allclose(found.vertices, person, atol=1e-3)
