@@ -10,6 +10,7 @@ help:
 	@echo "make demo    set up, then animate three unseen faces into runs/demo"
 	@echo "make test    set up, then run the tests"
 	@echo "make slow    the slow tests, by hand"
+	@echo "make browser the tests that need Chromium and Node, see README"
 	@echo "make lint    ruff"
 	@echo "make clean   remove the virtual environment and the runs"
 
@@ -30,6 +31,9 @@ test: setup
 
 slow: setup
 	$(BIN)/python -m pytest -n 2 -m slow
+
+browser: setup
+	$(BIN)/python -m pytest -m browser tests/io
 
 lint: setup
 	$(BIN)/ruff check .

@@ -25,8 +25,8 @@ FRESH = """
 import time
 begun = time.perf_counter()
 import jax
-from facejax import pipeline, produce
-produce.compile_cache()
+from facejax import pipeline, results
+results.compile_cache()
 models = pipeline.load()
 landmarks = pipeline.landmarks(models, jax.random.key(0), ["neutral", "high_smile"], models.face.vertices)
 jax.block_until_ready(pipeline.meshes(models, landmarks, models.face.vertices))

@@ -23,8 +23,7 @@ import jax
 import numpy as np
 import tyro
 
-from facejax import files
-from facejax.data import cache
+from facejax import files, results
 
 RESULTS = Path(__file__).parent / "results"
 Config = TypeVar("Config")
@@ -34,19 +33,13 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
     """Parse the command line, run, and say where the results are. Bad input: one line, exit code 2."""
     description = sys.modules[run.__module__].__doc__
     config = tyro.cli(config_type, prog=f"python -m experiments.{name}", description=description)
-    compile_cache()
+    results.compile_cache()
     try:
         run(config)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"experiments.{name}: {error}", file=sys.stderr)
         raise SystemExit(2) from error
     print(f"results in {config.out}")
-
-
-def compile_cache() -> None:
-    """Keep compiled programs between runs."""
-    jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "compiled"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None) -> dict[str, Any]:

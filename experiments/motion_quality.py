@@ -1,10 +1,10 @@
 """Do generated motions move like real ones? Amplitude, jitter and diversity against held-out subjects.
 
-Amplitude: mean peak displacement of neutral -> expression, per expression, against the mean of 40 held-out
-subjects, and against the training subjects: people differ, and the two real means by up to 16 %. Jitter: mean acceleration of the landmarks (second differences at 30 frames). Diversity: mean pairwise
-distance of samples of one pair, equal counts, generated against real. All 306 + 36 pairs of 18 expressions and
-neutral that data exist for; real peak -> peak transitions are made as those that the generator learnt from, of
-held-out subjects.
+Amplitude: mean peak displacement of neutral -> expression, per expression, against the mean of 40 held-out subjects and
+against that of the training subjects: people differ, and the two real means by up to 16 %. Jitter: mean acceleration of
+the landmarks (second differences at 30 frames). Diversity: mean pairwise distance of samples of one pair, equal
+counts. All 342 ordered pairs of 18 expressions and neutral; real peak -> peak transitions are made like those that the
+generator learnt from, of held-out subjects.
 
     python -m experiments.motion_quality --publish
 

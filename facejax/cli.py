@@ -137,9 +137,9 @@ def _generate(command: Generate) -> None:
 
 
 def _demo(command: Demo) -> None:
-    from facejax import produce
+    from facejax import demo
 
-    print(produce.demo(command.out, seed=command.seed).read_text())
+    print(demo.run(command.out, seed=command.seed).read_text())
 
 
 def _labels(command: Labels) -> None:

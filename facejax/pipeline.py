@@ -101,7 +101,7 @@ def landmarks(
     if not 0 <= intensity <= 2:
         raise ValueError(f"intensity must lie in 0..2, got {intensity}")
     rest = neutral_landmarks(models, neutral)
-    unitless = displacements(models, key, labels, samples=samples or 1, frames=frames)
+    unitless = displacements(models, key, labels, samples=1 if samples is None else samples, frames=frames)
     moved = rest + intensity * jnp.linalg.norm(rest - rest.mean(axis=0)) * unitless
     return moved if samples is not None else moved[0]
 

@@ -78,7 +78,7 @@ def test_view_makes_one_page(capsys, tmp_path):
     code, printed, _ = run(capsys, "view", tmp_path / "S100.ply", "--no-open")
     page = tmp_path / "S100.html"
     assert code == 0 and printed.strip() == str(page)
-    assert "http" not in page.read_text().replace("http://www.w3.org", "")
+    assert "://" not in page.read_text()
 
 
 def test_unknown_label_names_the_nearest(capsys, tmp_path):

@@ -1,0 +1,105 @@
+"""Animations made into files: which formats, where, and how the work shows itself.
+
+Everything that can be wrong with a request is checked before the first file is written; every file appears whole.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from facejax import files, io, pipeline
+from facejax.data import cache
+from facejax.io import dress, film
+
+FILM_RATE = 15.0  # frames per second of films: half the motion's, since drawing dominates the time
+
+
+def compile_cache() -> None:
+    """Keep compiled programs in the user's cache: the second start is then quick."""
+    jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def check_formats(formats: Sequence[str]) -> None:
+    """Raise, before any work is done, where a format cannot be written on this machine."""
+    if not formats:
+        raise ValueError("--formats: expected at least one")
+    for suffix in formats:
+        if f".{suffix}" in film.FORMATS:
+            film.check(Path(f"film.{suffix}"))
+
+
+def writable(folder: Path) -> None:
+    """Make a folder, or say in one line why files cannot be put there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be made ({error.strerror}); name another folder with --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder}: not writable; name another folder with --out")
+
+
+def scene_of(
+    models: pipeline.Models, neutral: np.ndarray, vertices: np.ndarray, marks: np.ndarray, labels, frames: int
+) -> io.scene.Scene:
+    """A generated animation with eyes, teeth and captions: neutral (N, 3), vertices (T, N, 3), marks (T, L, 3)."""
+    rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
+    parts = dress.parts(models.props, rest, marks)
+    captions = pipeline.captions(labels, frames=frames)
+    return io.scene.make(vertices, np.asarray(models.face.faces), captions=captions, landmarks=marks, extras=parts)
+
+
+def save(out: Path, stem: str, suffix: str, scene: io.scene.Scene, fps: float) -> Path:
+    """Write a scene as `out/stem.suffix` ("ply" and "obj": a folder of frames); returns the path."""
+    path, options = out / f"{stem}.{suffix}", {"captions": scene.captions, "extras": scene.extras}
+    if suffix in ("ply", "obj"):
+        path = out / f"{stem}-{suffix}"
+        io.meshes.write_sequence(path, scene.vertices, scene.faces, format=suffix)
+        return path
+    if f".{suffix}" in film.FORMATS:
+        every = max(1, round(fps / FILM_RATE))
+        scene, fps = _thinned(scene, every), fps / every
+        options = {"captions": scene.captions, "extras": scene.extras, "size": (256, 320)}
+    elif suffix == "html":
+        options["landmarks"] = scene.landmarks
+    elif suffix == "npz":
+        options = {"landmarks": scene.landmarks}
+    io.save(path, scene.vertices, scene.faces, fps=fps, title=stem, **options)
+    return path
+
+
+def save_landmarks(out: Path, landmarks: np.ndarray, labels: Sequence[str], frames: int, fps: float) -> Path:
+    """`landmarks.npz`: the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
+    path = out / "landmarks.npz"
+    starts = np.array([start for start, _ in pipeline.captions(labels, frames=frames)])
+    with files.replacing(path) as temporary:
+        np.savez(
+            temporary, landmarks=np.asarray(landmarks, np.float32), labels=np.array(labels),
+            starts=starts, fps=np.float64(fps),
+        )  # fmt: skip
+    return path
+
+
+def _thinned(scene: io.scene.Scene, every: int) -> io.scene.Scene:
+    chosen = slice(None, None, every)
+    parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
+    captions = tuple((start // every, text) for start, text in scene.captions)
+    return scene._replace(vertices=scene.vertices[chosen], captions=captions, extras=tuple(parts))
+
+
+@contextmanager
+def progress(name: str, total: int) -> Iterator:
+    """A bar on a terminal; silent elsewhere."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(name, total=total)
+        yield lambda: bar.advance(task)
