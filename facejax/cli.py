@@ -80,6 +80,8 @@ class Data:
     """Realism of the dataset."""
     head_motion: bool = False
     """Let heads turn and lean."""
+    noise: float = 0.0
+    """Registration noise in mm, smooth over the surface; 0.1 to 0.5 is what scans have."""
     out: Path | None = None
     """Where the dataset goes; the user's cache by default."""
 
@@ -150,11 +152,13 @@ def _labels(command: Labels) -> None:
 
 def _data(command: Data) -> None:
     from facejax import produce
+    from facejax.data import makehuman4d
 
     if command.sample is not None:
         print("\n".join(str(path) for path in produce.sample_faces(command.sample, command.count)))
     else:
-        print(produce.prepare(command.level, head_motion=command.head_motion, folder=command.out))
+        spec = makehuman4d.Spec(level=command.level, head_motion=command.head_motion, noise=command.noise)
+        print(produce.prepare(spec, folder=command.out))
 
 
 def _view(command: View) -> None:

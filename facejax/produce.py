@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from facejax import io, pipeline, results
-from facejax.data import assets, makehuman, makehuman4d
+from facejax.data import assets, makehuman, makehuman4d, noise
 from facejax.io import faces
 
 
@@ -81,9 +81,9 @@ def sample_faces(out: Path, count: int) -> list[Path]:
     return paths
 
 
-def prepare(level: int, *, head_motion: bool = False, folder: Path | None = None) -> Path:
-    """Make makehuman4d at one level, or find it made."""
-    spec = makehuman4d.Spec(level=level, head_motion=head_motion)
+def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
+    """Make a makehuman4d, or find it made; returns its folder."""
+    noise.check(spec.noise)
     if folder is not None:
         results.writable(folder)
     with results.progress(spec.name, spec.subjects) as advance:

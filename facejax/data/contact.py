@@ -10,10 +10,9 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from facejax.data import assets, makehuman
+from facejax.mesh import graph
 
 LID_THICKNESS = 1.0
 LID_REACH = 14.0  # geodesic distance from the lid's edge within which skin lies on the eyeball
@@ -107,47 +106,24 @@ def part_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
 def template_regions() -> Regions:
     """The vertex sets that touch something, on the template."""
     shape = makehuman.template()
-    loops = boundary_loops(shape.faces)
+    loops = graph.boundary_loops(shape.faces)
     eyes = sorted((loop for loop in loops if len(loop) == 28), key=lambda loop: -shape.vertices[loop, 0].mean())
     (mouth,) = (loop for loop in loops if len(loop) == 38)
-    lids = tuple(np.flatnonzero(geodesic(shape.vertices, shape.faces, loop) < LID_REACH) for loop in eyes)
+    lids = tuple(np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, loop) < LID_REACH) for loop in eyes)
     pairs = _lip_pairs(shape.vertices, mouth)
-    near = np.flatnonzero(geodesic(shape.vertices, shape.faces, mouth) < LIP_REACH)
-    to_upper = geodesic(shape.vertices, shape.faces, pairs[:, 0])
-    to_lower = geodesic(shape.vertices, shape.faces, pairs[:, 1])
+    near = np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, mouth) < LIP_REACH)
+    to_upper = graph.geodesic(shape.vertices, shape.faces, pairs[:, 0])
+    to_lower = graph.geodesic(shape.vertices, shape.faces, pairs[:, 1])
     sign = np.where(to_upper < to_lower, 1.0, -1.0)[near]
     edge = np.where(sign[:, None] > 0, pairs[:, 0], pairs[:, 1])
     distance = np.linalg.norm(shape.vertices[near][:, None] - shape.vertices[edge], axis=-1)
     kernel = np.exp(-0.5 * (distance / 2.5) ** 2)
     kernel /= np.maximum(kernel.sum(axis=1, keepdims=True), 1e-12)
-    reach = geodesic(shape.vertices, shape.faces, mouth)[near]
+    reach = graph.geodesic(shape.vertices, shape.faces, mouth)[near]
     fade = np.clip(1 - reach / LIP_REACH, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
-    teeth = np.flatnonzero(geodesic(shape.vertices, shape.faces, mouth) < TEETH_REACH)
+    teeth = np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, mouth) < TEETH_REACH)
     return Regions(lids, pairs, near, (sign * fade)[:, None].astype(np.float32) * kernel.astype(np.float32), teeth)
-
-
-def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The boundary's closed loops, each as its vertices in order."""
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    inner = {(b, a) for a, b in directed.tolist()}
-    follows = {a: b for a, b in directed.tolist() if (a, b) not in inner}
-    loops = []
-    while follows:
-        loop = [next(iter(follows))]
-        while (after := follows.pop(loop[-1])) != loop[0]:
-            loop.append(after)
-        loops.append(np.array(loop))
-    return loops
-
-
-def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """Shortest path along edges from the nearest source to every vertex, (N,) millimetres."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.sort(edges, axis=1), axis=0)
-    length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
-    graph = sparse.csr_matrix((length, edges.T), shape=(len(vertices), len(vertices)))
-    return csgraph.dijkstra(graph, directed=False, indices=np.asarray(sources), min_only=True)
 
 
 def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax import files
-from facejax.data import assets, cache, makehuman, performance, rig, store
+from facejax.data import assets, cache, makehuman, noise, performance, rig, store
 
 VERSION = 1
 SEED = 1
@@ -49,12 +49,15 @@ class Spec(NamedTuple):
     meshes: int = 20_000
     seed: int = SEED
     head_motion: bool = False
+    noise: float = 0.0  # registration noise, mm in root mean square
 
     @property
     def name(self) -> str:
         """The dataset's folder name."""
         motion = "-headmotion" if self.head_motion else ""
-        return f"makehuman4d-v{VERSION}-level{self.level}-{self.subjects}x{self.meshes}-seed{self.seed}{motion}"
+        noisy = f"-noise{self.noise:g}" if self.noise else ""
+        size = f"{self.subjects}x{self.meshes}"
+        return f"makehuman4d-v{VERSION}-level{self.level}-{size}-seed{self.seed}{motion}{noisy}"
 
 
 def prepare(
@@ -129,6 +132,9 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
                 if spec.head_motion:
                     skin = turn(skin, head[low : low + CHUNK])
                 row = first[mine[0]] + low
+                if spec.noise:
+                    rng = np.random.default_rng([spec.seed, 2**21, row])
+                    skin = skin + noise.field(len(skin), rng, sigma=spec.noise)
                 landmarks[row : row + len(skin)] = skin[:, loaded.landmarks]
                 a, b = np.searchsorted(drawn, [row, row + len(skin)])
                 vertices[a:b] = skin[drawn[a:b] - row]

@@ -6,6 +6,7 @@ Millimetres, y up, z out of the face.
 import numpy as np
 
 from facejax.io import scene
+from facejax.mesh import graph
 
 TEETH, TONGUE = (0.80, 0.77, 0.71), (0.58, 0.30, 0.29)
 
@@ -54,17 +55,7 @@ def stopper(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     The widest hole of a head is its neck. A mesh with fewer than two holes (a mask) is left open: no
     triangles. vertices: (N, 3). Vertices are those of the mesh; none is added.
     """
-    edge = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
-    inner = {(b, a) for a, b in edge}
-    follow = {b: a for a, b in edge if (a, b) not in inner}
-    loops = []
-    while follow:
-        start, loop = next(iter(follow)), []
-        at = start
-        while at in follow:
-            loop.append(at)
-            at = follow.pop(at)
-        loops.append(loop)
+    loops = [loop[::-1].tolist() for loop in graph.boundary_loops(faces)]
     if len(loops) < 2:
         return np.zeros((0, 3), np.int32)
     length = [np.linalg.norm(np.diff(vertices[loop + loop[:1]], axis=0), axis=1).sum() for loop in loops]

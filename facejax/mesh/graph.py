@@ -79,3 +79,20 @@ def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple
 def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Distance (N,) along edges to the nearest source vertex, in the vertices' unit; inf if unreachable."""
     return paths(np.asarray(vertices, np.float64), faces, sources)[0]
+
+
+def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """The boundary's closed loops, each as its vertices in the order in which its triangles run."""
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    inner = {(b, a) for a, b in directed.tolist()}
+    follows = {a: b for a, b in directed.tolist() if (a, b) not in inner}
+    loops = []
+    while follows:
+        loop = [next(iter(follows))]
+        after = follows.pop(loop[0])
+        # Where a broken mesh's boundary touches itself, a chain may end without closing.
+        while after != loop[0] and after in follows:
+            loop.append(after)
+            after = follows.pop(after)
+        loops.append(np.array(loop))
+    return loops

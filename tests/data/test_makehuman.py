@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from facejax.data import contact, makehuman
+from facejax.data import makehuman
+from facejax.mesh import graph
 
 
 def test_face_mask_is_25_mm_about_the_landmarks(template):
-    distance = contact.geodesic(template.vertices, template.faces, template.landmarks)
+    distance = graph.geodesic(template.vertices, template.faces, template.landmarks)
     np.testing.assert_array_equal(template.face_mask, distance <= 25.0)
 
 
