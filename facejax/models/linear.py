@@ -148,7 +148,7 @@ def _basis(batches: Batches, *, components: int, passes: int = 3, seed: int = 0)
             shapes = points
             if directions is None:
                 width = min(components + 40, y.shape[1])
-                directions = np.linalg.qr(rng.standard_normal((y.shape[1], width)))[0]
+                directions = _orthonormal(rng.standard_normal((y.shape[1], width)))
             seen = y @ directions
             count += len(x)
             sum_x, sum_y, square = sum_x + x.sum(axis=0), sum_y + y.sum(axis=0), square + np.sum(y**2)
@@ -159,7 +159,7 @@ def _basis(batches: Batches, *, components: int, passes: int = 3, seed: int = 0)
         image = image / count - np.outer(mean_y, mean_y @ directions)  # covariance @ directions
         loads = loads / count - np.outer(mean_x, mean_y @ directions)
         small = directions.T @ image
-        followed, directions = directions, np.linalg.qr(image)[0]
+        followed, directions = directions, _orthonormal(image)
     variance, turn = np.linalg.eigh((small + small.T) / 2)
     order = np.argsort(variance)[::-1][:components]
     # Directions in which nothing moves are no components.
@@ -174,6 +174,19 @@ def _basis(batches: Batches, *, components: int, passes: int = 3, seed: int = 0)
         variance,
         float(square / count - np.sum(mean_y**2)),
     )
+
+
+def _orthonormal(columns: np.ndarray) -> np.ndarray:
+    """An orthonormal basis (D, k) of the span of columns (D, m), k <= m.
+
+    By the Gram matrix, twice over for the digits that squaring loses: two thin products, where a Householder QR of
+    9,780 x 260 takes ten times as long.
+    """
+    for _ in range(2):
+        values, vectors = np.linalg.eigh(columns.T @ columns)
+        kept = values > 1e-13 * values[-1]
+        columns = columns @ (vectors[:, kept] / np.sqrt(values[kept]))
+    return columns
 
 
 def _solve_pca(basis: Basis, *, alpha: float) -> Params:

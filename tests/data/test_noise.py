@@ -28,7 +28,7 @@ def test_neighbours_move_together_and_far_vertices_do_not(template):
 
 
 def test_a_noisy_dataset_stands_beside_the_clean_one(tiny_spec, tmp_path):
-    spec = tiny_spec._replace(subjects=3, level=0, meshes=20)
+    spec = tiny_spec._replace(subjects=1, level=0, meshes=20)
     clean, noisy, again = (
         makehuman4d.prepare(s, folder=tmp_path / n)
         for s, n in ((spec, "a"), (spec._replace(noise=0.2), "b"), (spec._replace(noise=0.2), "c"))
