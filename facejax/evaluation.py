@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import jax
 import numpy as np
 
+from facejax import metrics
 from facejax.data.meshes import Batch, Meshes
 from facejax.models import linear
 
@@ -20,7 +21,7 @@ def vertex_errors(
     """Mean and standard deviation of the vertex distance over vertices x frames, per region (a mask (N,))."""
     count, total, squares = 0, 0.0, 0.0
     for landmarks, vertices in meshes:
-        distance = np.linalg.norm(np.asarray(decode(landmarks), np.float64) - vertices, axis=-1)
+        distance = np.asarray(metrics.vertex_distance(decode(landmarks), vertices), np.float64)
         count += len(distance)
         total, squares = total + distance.sum(axis=0), squares + (distance**2).sum(axis=0)
     if count == 0:

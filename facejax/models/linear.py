@@ -21,6 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from facejax import metrics
+
 Batches = Iterable[tuple[np.ndarray, np.ndarray]]
 
 
@@ -87,11 +89,16 @@ def choose(
         for landmarks, vertices in held_out:
             count += vertices.shape[0] * vertices.shape[1]
             for i, params in enumerate(solved):
-                off = np.asarray(apply(params, jnp.asarray(landmarks, jnp.float32))) - vertices
-                totals[i] += np.linalg.norm(off, axis=-1).sum()
+                totals[i] += np.sum(_distances(params, landmarks, vertices), dtype=np.float64)
     if count == 0 or len(alphas) == 0:
         raise ValueError("expected held-out frames and at least one alpha, got none")
     return float(alphas[int(np.argmin(totals))]), totals / count
+
+
+@jax.jit
+def _distances(params: Params, landmarks: jax.Array, vertices: jax.Array) -> jax.Array:
+    """Distance of each vertex, summed over it: (B,)."""
+    return jnp.sum(metrics.vertex_distance(apply(params, landmarks), vertices), axis=-1)
 
 
 def _moments(batches: Batches) -> Moments:
