@@ -21,8 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax import metrics
-
 Batches = Iterable[tuple[np.ndarray, np.ndarray]]
 
 
@@ -89,7 +87,7 @@ def choose(
         for landmarks, vertices in held_out:
             count += vertices.shape[0] * vertices.shape[1]
             for i, params in enumerate(solved):
-                totals[i] += np.sum(_distances(params, landmarks, vertices), dtype=np.float64)
+                totals[i] += np.sum(np.asarray(_distances(params, landmarks, vertices)), dtype=np.float64)
     if count == 0 or len(alphas) == 0:
         raise ValueError("expected held-out frames and at least one alpha, got none")
     return float(alphas[int(np.argmin(totals))]), totals / count
@@ -98,7 +96,8 @@ def choose(
 @jax.jit
 def _distances(params: Params, landmarks: jax.Array, vertices: jax.Array) -> jax.Array:
     """Distance of each vertex, summed over it: (B,)."""
-    return jnp.sum(metrics.vertex_distance(apply(params, landmarks), vertices), axis=-1)
+    off = apply(params, landmarks) - vertices
+    return jnp.sum(jnp.sqrt(jnp.sum(off * off, axis=-1)), axis=-1)
 
 
 def _moments(batches: Batches) -> Moments:
