@@ -29,7 +29,7 @@ class Generate:
     start: str = "neutral"
     """Expression to start from."""
     then: UseAppendAction[tuple[str, ...]] = ()
-    """A further expression; may be given several times."""
+    """A further expression; repeat the flag: `--then A --then B`."""
     face: Path | None = None
     """Neutral face (PLY, OBJ or NPZ): the model's 3,260 vertices, or a MakeHuman body. Default: the average face."""
     model: Path | None = None
@@ -45,7 +45,7 @@ class Generate:
     intensity: float = 1.0
     """Scale of the motion, 0 to 2."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
-    """What to write; the landmarks come as `landmarks.npz` in any case. "ply" and "obj" write a folder of frames."""
+    """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,7 +50,7 @@ def run(out: Path, *, seed: int = 7) -> Path:
         labels = [f"frame {t + 1}" for t in chosen]
         _picture(out / "contact_sheet.png", render.contact_sheet(rows, row_labels=names, column_labels=labels))
         advance()
-        results.save_landmarks(out, np.stack(marks), LABELS, 30, pipeline.RATE)
+        results.save_landmarks(out / "landmarks.npz", np.stack(marks), LABELS, 30, pipeline.RATE)
         advance()
     return _summary(out, names, clock)
 

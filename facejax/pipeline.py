@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
 from facejax import weights
 from facejax.geometry import align, srvf
@@ -113,6 +114,9 @@ def displacements(
     indices = label_indices(models, labels)
     if len(indices) < 2:
         raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+    for before, after in zip(labels[:-1], labels[1:], strict=True):
+        if before == after:
+            raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")
     if frames < 2 or samples < 1:
         raise ValueError(f"frames must be 2 or more and samples 1 or more, got {frames} and {samples}")
     pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
@@ -156,36 +160,38 @@ def _compose(generator, beginnings, keys, pairs, *, frames):
     """Unitless displacements from neutral (S, T, L, 3) through P transitions (P, 2)."""
 
     def one(key):
-        start_key, motion_key = jax.random.split(key)
-        motion_keys = jax.random.split(motion_key, len(pairs))
-
         def transition(displacement, inputs):
-            key, (start, end) = inputs
-            curve = _settle(srvf.decode(*motion.sample(generator, key, start, end), displacement), end)
+            key, first, (start, end) = inputs
+            motion_key, start_key = jax.random.split(key)
+            q, log_length = motion.sample(generator, motion_key, start, end)
+            travel = srvf.decode(q, log_length, jnp.zeros_like(displacement))[-1]
+            # The motion was made for somebody who starts there, and ends at a peak of `end`.
+            meant = starts.sample(beginnings, start_key, travel, start, end)
+            here = jnp.where(first, meant, displacement)
+            curve = _settle(srvf.decode(q, log_length, meant), here)
             if frames != curve.shape[0]:
                 curve = align.resample(curve, frames=frames)
             return curve[-1], curve
 
-        # The first start depends on the first motion, which is therefore drawn twice: it is the cheapest part.
-        origin = jnp.zeros_like(beginnings.mean[0])
-        travel = srvf.decode(*motion.sample(generator, motion_keys[0], *pairs[0]), origin)[-1]
-        begin = starts.sample(beginnings, start_key, travel, *pairs[0])
-        _, curves = jax.lax.scan(transition, begin, (motion_keys, pairs))
+        first = jnp.arange(len(pairs)) == 0
+        inputs = (jax.random.split(key, len(pairs)), first, pairs)
+        _, curves = jax.lax.scan(transition, jnp.zeros_like(beginnings.mean[0]), inputs)
         rest = curves[:, 1:].reshape(-1, *curves.shape[2:])
         return jnp.concatenate([curves[0, :1], rest])
 
     return jax.vmap(one)(keys)
 
 
-def _settle(curve: jax.Array, end: jax.Array) -> jax.Array:
-    """Let a transition to neutral end there exactly.
+def _settle(curve: jax.Array, start: jax.Array) -> jax.Array:
+    """Let a curve (T, L, 3) begin at `start` (L, 3), and end where it was going.
 
-    The generator knows labels, not where the face stands, so what remains at the end is faded out along the way in
-    proportion to the path covered: no jump, and no motion where there was none.
+    The generator knows labels, not where the face stands. Added up as they come, transitions would drift ever further
+    from any face; here what separates the two beginnings fades in proportion to the path covered: no jump, no motion
+    where there was none, and every transition ends at a peak of its own label. A way home ends at neutral exactly.
     """
     steps = jnp.sqrt(jnp.sum(jnp.diff(curve, axis=0) ** 2, axis=(1, 2)))
     covered = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)]) / jnp.maximum(jnp.sum(steps), 1e-12)
-    return curve - jnp.where(end == 0, 1.0, 0.0) * covered[:, None, None] * curve[-1]
+    return curve + (1 - covered)[:, None, None] * (start - curve[0])
 
 
 @jax.jit
@@ -198,13 +204,8 @@ def _structure(shapes: dict[str, list]) -> dict[str, Any]:
 
     Raises `KeyError` or `TypeError` where the names are not those of our records.
     """
-    nested: dict[str, Any] = {}
-    for name, (dtype, shape) in shapes.items():
-        *path, last = name.split("/")
-        inner = nested
-        for step in path:
-            inner = inner.setdefault(step, {})
-        inner[last] = jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
+    flat = {name: jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype)) for name, (dtype, shape) in shapes.items()}
+    nested = traverse_util.unflatten_dict(flat, sep="/")
     tables = {f"{table}/{i}": leaf for table, rows in nested["hierarchy"].items() for i, leaf in rows.items()}
     networks = {}
     for name in ("motion", "decoder"):

@@ -31,8 +31,7 @@ def generate(
     models = pipeline.load(model)
     pipeline.label_indices(models, labels)
     results.check_formats(formats)
-    if not 0 < fps <= 1000:
-        raise ValueError(f"--fps must lie above 0, up to 1000, got {fps}")
+    results.check_rate(fps)
     landmarks = pipeline.landmarks(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )
@@ -41,12 +40,14 @@ def generate(
     with results.progress("writing", samples * len(formats) + 1) as advance:
         for i, marks in enumerate(np.asarray(landmarks)):
             vertices = np.asarray(pipeline.meshes(models, marks, neutral))
-            stem = "_".join(labels) if samples == 1 else f"{'_'.join(labels)}-{i + 1}"
+            stem = results.stem(labels) if samples == 1 else f"{results.stem(labels)}-{i + 1}"
             scene = results.scene_of(models, neutral, vertices, marks, labels, frames)
             for suffix in formats:
                 written.append(results.save(out, stem, suffix, scene, fps))
                 advance()
-        written.append(results.save_landmarks(out, landmarks, labels, frames, fps))
+        written.append(
+            results.save_landmarks(out / f"{results.stem(labels)}-landmarks.npz", landmarks, labels, frames, fps)
+        )
         advance()
     return written
 
@@ -87,19 +88,25 @@ def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
     if folder is not None:
         results.writable(folder)
     with results.progress(spec.name, spec.subjects) as advance:
-        return makehuman4d.prepare(spec, folder=folder, progress=lambda done, total: advance()).path
+        return makehuman4d.prepare(spec, folder=folder, progress=lambda done, total: advance(done)).path
 
 
 def view(path: Path, out: Path | None = None, *, fps: float | None = None) -> Path:
-    """One HTML page for an animation or a mesh; returns its path."""
+    """One HTML page for an animation or a mesh; returns its path. `out` names the page, or a folder for it."""
+    page = path.with_suffix(".html") if out is None else out / f"{path.stem}.html" if out.is_dir() else out
+    if page.suffix.lower() != ".html":
+        raise ValueError(f"{page}: the page's name must end in .html")
     if path.suffix.lower() == ".html":
         if not path.is_file():
             raise ValueError(f"{path}: no such file")
+        if page != path:
+            raise ValueError(f"{path} is a page already; leave --out away to open it")
         return path
     vertices, triangles, extra = _animation(path)
-    page = out or path.with_suffix(".html")
+    stored = extra.pop("fps", 30.0)
+    results.check_rate(stored if fps is None else fps)
     results.writable(page.parent)
-    io.save(page, vertices, triangles, fps=fps or extra.pop("fps", 30.0), title=path.stem, **extra)
+    io.save(page, vertices, triangles, fps=stored if fps is None else fps, title=path.stem, **extra)
     return page
 
 

@@ -34,7 +34,22 @@ def check_formats(formats: Sequence[str]) -> None:
         raise ValueError("--formats: expected at least one")
     for suffix in formats:
         if f".{suffix}" in film.FORMATS:
-            film.check(Path(f"film.{suffix}"))
+            try:
+                film.check(Path(f"film.{suffix}"))
+            except ImportError as error:
+                raise ValueError(f"--formats {suffix}: {error}") from error
+
+
+def check_rate(fps: float) -> None:
+    """Raise for frames per second that no player shows."""
+    if not 0 < fps <= 1000:
+        raise ValueError(f"--fps must lie above 0, up to 1000, got {fps}")
+
+
+def stem(labels: Sequence[str]) -> str:
+    """A file name for a motion through labels; a long chain is named by its ends."""
+    whole = "_".join(labels)
+    return whole if len(whole) <= 80 else f"{labels[0]}_{labels[-1]}_{len(labels) - 1}_transitions"
 
 
 def writable(folder: Path) -> None:
@@ -76,9 +91,8 @@ def save(out: Path, stem: str, suffix: str, scene: io.scene.Scene, fps: float) -
     return path
 
 
-def save_landmarks(out: Path, landmarks: np.ndarray, labels: Sequence[str], frames: int, fps: float) -> Path:
-    """`landmarks.npz`: the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
-    path = out / "landmarks.npz"
+def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], frames: int, fps: float) -> Path:
+    """An NPZ of the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
     starts = np.array([start for start, _ in pipeline.captions(labels, frames=frames)])
     with files.replacing(path) as temporary:
         np.savez(
@@ -89,9 +103,10 @@ def save_landmarks(out: Path, landmarks: np.ndarray, labels: Sequence[str], fram
 
 
 def _thinned(scene: io.scene.Scene, every: int) -> io.scene.Scene:
-    chosen = slice(None, None, every)
+    # The last frame is where the motion was going: it stays.
+    chosen = np.append(np.arange(0, len(scene.vertices) - 1, every), len(scene.vertices) - 1)
     parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
-    captions = tuple((start // every, text) for start, text in scene.captions)
+    captions = tuple((-(-start // every), text) for start, text in scene.captions)
     return scene._replace(vertices=scene.vertices[chosen], captions=captions, extras=tuple(parts))
 
 
@@ -102,4 +117,4 @@ def progress(name: str, total: int) -> Iterator:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(name, total=total)
-        yield lambda: bar.advance(task)
+        yield lambda done=None: bar.advance(task) if done is None else bar.update(task, completed=done)

@@ -39,10 +39,11 @@ def test_generate_writes_what_it_says(capsys, tmp_path):
     )  # fmt: skip
     assert code == 0
     names = {f"neutral_high_smile_neutral-{i}" for i in (1, 2)}
-    expected = {f"{n}.{s}" for n in names for s in ("glb", "npz")} | {f"{n}-ply" for n in names} | {"landmarks.npz"}
+    expected = {f"{n}.{s}" for n in names for s in ("glb", "npz")} | {f"{n}-ply" for n in names}
+    expected |= {"neutral_high_smile_neutral-landmarks.npz"}
     assert {path.name for path in out.iterdir()} == expected
     assert {os.path.basename(line) for line in printed.split()} == expected
-    with np.load(out / "landmarks.npz") as arrays:
+    with np.load(out / "neutral_high_smile_neutral-landmarks.npz") as arrays:
         assert arrays["landmarks"].shape == (2, 15, 68, 3)
         assert arrays["labels"].tolist() == ["neutral", "high_smile", "neutral"]
         assert arrays["starts"].tolist() == [0, 7]
@@ -79,6 +80,11 @@ def test_view_makes_one_page(capsys, tmp_path):
     page = tmp_path / "S100.html"
     assert code == 0 and printed.strip() == str(page)
     assert "://" not in page.read_text()
+    run(capsys, "generate", "--end", "fear", "--frames", 3, "--formats", "npz", "--out", tmp_path)
+    code, printed, _ = run(capsys, "view", tmp_path / "neutral_fear.npz", "--fps", 10, "--out", tmp_path, "--no-open")
+    assert code == 0 and printed.strip() == str(tmp_path / "neutral_fear.html")
+    code, _, err = run(capsys, "view", tmp_path / "S100.ply", "--out", tmp_path / "picture.png", "--no-open")
+    assert code == 2 and "must end in .html" in err and not (tmp_path / "picture.png").exists()
 
 
 def test_unknown_label_names_the_nearest(capsys, tmp_path):

@@ -47,6 +47,8 @@ def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store
         found = evaluation.vertex_errors(lambda m: decoder.apply(params, hierarchy, m), train, regions)
         return found["face"]["mean_mm"]
 
+    with pytest.raises(ValueError, match="a run with another plan, seed"):
+        fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan._replace(steps=50), seed=1)
     untrained = decoder.init(jax.random.key(0), hierarchy, scale=whole.scale)
     assert mean(whole) < 0.85 * mean(untrained)
 

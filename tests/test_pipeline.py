@@ -81,6 +81,18 @@ def test_frames_and_a_start_at_a_peak(models, person):
     np.testing.assert_allclose(moved[-1], rest, atol=1e-3)
 
 
+def test_a_long_chain_neither_drifts_nor_jumps(models, person):
+    """Twenty transitions: every visit to a label looks like the first."""
+    cycle = ["high_smile", "mouth_open", "surprise", "mouth_side", "anger"]
+    moved = np.asarray(pipeline.landmarks(models, KEY, ["neutral", *cycle * 4], person.vertices, samples=8))
+    rest = person.vertices[np.asarray(models.face.landmark_index)]
+    largest = np.linalg.norm(moved - rest, axis=-1).max(axis=-1)[:, 29::29].mean(axis=0).reshape(4, 5)
+    np.testing.assert_allclose(largest[3], largest[0], rtol=0.35)
+    steps = np.linalg.norm(np.diff(moved, axis=1), axis=-1).max(axis=-1)
+    joints = np.arange(29, moved.shape[1] - 1, 29)
+    assert steps[:, joints].mean() < 1.5 * steps.mean()
+
+
 def test_captions_follow_the_joints():
     assert pipeline.captions(["a", "b", "c"], frames=30) == ((0, "a → b"), (29, "b → c"))
 
@@ -91,6 +103,7 @@ def test_captions_follow_the_joints():
         (["neutral", "high_smlie"], {}, "unknown label 'high_smlie': did you mean high_smile"),
         (["neutral", "qqqq"], {}, "there are neutral, bareteeth"),
         (["neutral"], {}, "a start and an end"),
+        (["neutral", "anger", "anger"], {}, "'anger' follows itself"),
         (["neutral", "anger"], {"frames": 1}, "2 or more"),
         (["neutral", "anger"], {"samples": 0}, "1 or more"),
         (["neutral", "anger"], {"intensity": 2.5}, r"0\.\.2, got 2.5"),

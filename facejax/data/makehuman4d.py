@@ -163,7 +163,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             "rate": performance.HANDED_OUT,
             "labels": performance.LABELS,
             "shapes": shapes,
-            "hashes": {name: files.sha256(temporary / f"{name}.npy") for name in ("landmarks", "vertices", "drawn")},
+            "hashes": {name: files.sha256(temporary / f"{name}.npy") for name in shapes},
             "subjects": people,
             "sequences": [s._asdict() for s in sequences],
         }

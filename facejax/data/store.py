@@ -95,7 +95,14 @@ def open_store(path: Path) -> Store:
             arrays[name] = np.load(path / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as error:
             raise StoreError(f"{path / name}.npy cannot be read ({error}): prepare the dataset anew") from error
-        expected = index["shapes"][name]
-        if list(arrays[name].shape) != expected:
-            raise StoreError(f"{path / name}.npy has shape {arrays[name].shape}, expected {tuple(expected)}")
-    return Store(path, index, tuple(Sequence(**s) for s in index["sequences"]), **arrays)
+    try:
+        for name, array in arrays.items():
+            expected = index["shapes"][name]
+            if list(array.shape) != expected:
+                raise StoreError(f"{path / name}.npy has shape {array.shape}, expected {tuple(expected)}")
+        sequences = tuple(Sequence(**s) for s in index["sequences"])
+        if not {"labels", "rate", "spec", "subjects"} <= set(index):
+            raise KeyError("labels, rate, spec or subjects")
+    except (KeyError, TypeError) as error:
+        raise StoreError(f"{path / 'index.json'} lacks {error}: prepare the dataset anew") from error
+    return Store(path, index, sequences, **arrays)

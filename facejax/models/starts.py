@@ -68,7 +68,11 @@ def sample(params: Params, key: jax.Array, travel: jax.Array, start, end) -> jax
     gain = jnp.linalg.solve(here + there + floor, here).T
     noise = jax.random.normal(key, found.shape)
     # The root of the remaining covariance; rounding may leave tiny negative eigenvalues.
-    values, vectors = jnp.linalg.eigh((here - gain @ here + (here - gain @ here).T) / 2)
+    left = here - gain @ here
+    known = (jnp.asarray(start) == 0) | (jnp.asarray(end) == 0)
+    # Where nothing is left to guess all eigenvalues are 0, and the gradient of `eigh` would be NaN.
+    left = jnp.where(known, jnp.diag(1.0 + jnp.arange(len(found))), (left + left.T) / 2)
+    values, vectors = jnp.linalg.eigh(left)
     drawn = -gain @ found + vectors @ (jnp.sqrt(jnp.maximum(values, 0.0)) * noise)
     inside = params.mean[start] + jnp.tensordot(drawn, params.basis, 1)
     # What the basis does not span is known exactly in the one case where nothing is left to guess.

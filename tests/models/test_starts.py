@@ -56,3 +56,18 @@ def test_the_guess_beats_the_mean(peaks, params):
 def test_an_expression_without_peaks_is_refused(peaks):
     with pytest.raises(ValueError, match="two peaks or more"):
         starts.fit(*peaks, classes=5)
+
+
+@pytest.mark.parametrize(("start", "end"), [(0, 1), (2, 0), (1, 3)])
+def test_gradients_are_finite_and_those_of_finite_differences(params, start, end):
+    travel = np.random.default_rng(4).normal(size=(5, 3)).astype(np.float32)
+
+    def total(travel):
+        return jax.numpy.sum(starts.sample(params, jax.random.key(5), travel, start, end) ** 2)
+
+    slope = np.asarray(jax.grad(total)(travel))
+    assert np.isfinite(slope).all()
+    step = np.zeros_like(travel)
+    step[2, 1] = 1e-2
+    difference = (total(travel + step) - total(travel - step)) / 2e-2
+    assert slope[2, 1] == pytest.approx(float(difference), rel=2e-2, abs=1e-3)
