@@ -113,7 +113,7 @@ def _table(found: dict[str, Any]) -> str:
         row("diversity within a pair, held out", found["diversity_ratio"], "diversity_ratio", "≥ 0.5"),
     ]
     note = (
-        f"{found['pairs_acceleration_above_1.5']} of {found['pairs']} pairs accelerate more than 1.5 times as real ones, "
+        f"{found['pairs_acceleration_above_1.5']} of {found['pairs']} pairs accelerate more than 1.5 times as real ones, "  # noqa: E501
         f"{found['pairs_diversity_below_0.5']} are less than half as diverse."
     )
     return note + "\n\n" + _run.markdown(("generated / real", "mean", "range", "wanted"), rows)

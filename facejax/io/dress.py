@@ -17,6 +17,7 @@ MOUTH = (*range(31, 36), *range(48, 68))
 JAW = range(4, 13)
 IBUG = 68
 SHRINK, SET_BACK = 0.92, 2.0  # of the teeth; millimetres
+FRONT = 18.0  # depth of the teeth that are shown, millimetres
 
 
 class Props(NamedTuple):
@@ -54,9 +55,20 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
     moving = np.asarray(
         align.apply(_fit(jaw, landmarks, JAW, scaling=False), np.broadcast_to(lower, (len(landmarks), *lower.shape)))
     )
-    found.append(scene.Part(upper, template.upper_faces, props.TEETH, 0.6))
-    found.append(scene.Part(moving, template.lower_faces, props.TEETH, 0.6))
+    for teeth, faces, placed in (
+        (template.upper_teeth, template.upper_faces, upper),
+        (template.lower_teeth, template.lower_faces, moving),
+    ):
+        used, front = _front(teeth, faces)
+        found.append(scene.Part(placed[..., used, :], front, props.TEETH, 0.6))
     return tuple(found)
+
+
+def _front(teeth: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and triangles of the front teeth: with no cheek inside, molars would shine through an open mouth."""
+    front = faces[(teeth[faces, 2] > teeth[:, 2].max() - FRONT).all(axis=1)]
+    used, renumbered = np.unique(front, return_inverse=True)
+    return used, renumbered.reshape(front.shape).astype(np.int32)
 
 
 def _behind_the_lips(teeth: np.ndarray) -> np.ndarray:
