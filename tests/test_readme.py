@@ -27,7 +27,8 @@ def test_the_api_example_is_there_and_short():
 
 def test_commands_parse(capsys, monkeypatch):
     """Every `facejax ...` line of the README is accepted by the command line, up to running it."""
-    lines = re.findall(r"^facejax (.+?)(?:\s+#.*)?$", README, re.MULTILINE)
+    blocks = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+    lines = re.findall(r"^facejax (.+?)(?:\s+#.*)?$", blocks, re.MULTILINE)
     assert len(lines) >= 5
     for line in lines:
         seen = []
@@ -39,7 +40,7 @@ def test_commands_parse(capsys, monkeypatch):
 def test_links_and_modules_exist():
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
         assert (ROOT / target).exists(), target
-    for module in set(re.findall(r"python -m (experiments|benchmarks)\.(\w+)", README)):
+    for module in set(re.findall(r"python -m (experiments|benchmarks)\.([a-z]\w+)", README)):
         assert (ROOT / module[0] / f"{module[1]}.py").exists(), module
 
 
