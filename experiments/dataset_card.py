@@ -25,7 +25,7 @@ from experiments import _run
 from facejax import evaluation, files
 from facejax.data import assets, contact, makehuman, makehuman4d, performance, rig, store
 from facejax.data.meshes import of_split
-from facejax.io import props, render, scene
+from facejax.io import dress, props, render, scene
 from facejax.models import linear
 
 matplotlib.use("Agg")
@@ -179,7 +179,11 @@ def _portrait(vertices: np.ndarray) -> np.ndarray:
         else:
             colour = props.TONGUE if "tongue" in name else props.TEETH
             used, local = np.unique(triangles, return_inverse=True)
-            parts.append(scene.Part(vertices[used], local.reshape(-1, 3), colour, 0.6))
+            local = local.reshape(-1, 3)
+            if "teeth" in name:
+                shown, local = dress.front(loaded.base[used], local)
+                used = used[shown]
+            parts.append(scene.Part(vertices[used], local, colour, 0.6))
     skin = vertices[: loaded.skin]
     camera = render.aim(makehuman.template().vertices * 1.08, size=PICTURE, turn=18)
     return render.image(skin, loaded.faces, size=PICTURE, camera=camera, extras=parts)

@@ -59,16 +59,16 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
         (template.upper_teeth, template.upper_faces, upper),
         (template.lower_teeth, template.lower_faces, moving),
     ):
-        used, front = _front(teeth, faces)
-        found.append(scene.Part(placed[..., used, :], front, props.TEETH, 0.6))
+        used, shown = front(teeth, faces)
+        found.append(scene.Part(placed[..., used, :], shown, props.TEETH, 0.6))
     return tuple(found)
 
 
-def _front(teeth: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def front(teeth: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of the front teeth: with no cheek inside, molars would shine through an open mouth."""
-    front = faces[(teeth[faces, 2] > teeth[:, 2].max() - FRONT).all(axis=1)]
-    used, renumbered = np.unique(front, return_inverse=True)
-    return used, renumbered.reshape(front.shape).astype(np.int32)
+    shown = faces[(teeth[faces, 2] > teeth[:, 2].max() - FRONT).all(axis=1)]
+    used, renumbered = np.unique(shown, return_inverse=True)
+    return used, renumbered.reshape(shown.shape).astype(np.int32)
 
 
 def _behind_the_lips(teeth: np.ndarray) -> np.ndarray:
