@@ -21,7 +21,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _run
-from facejax import evaluation, fitting, pipeline
+from facejax import evaluation, fitting, journal, pipeline
 from facejax.data import cache, makehuman, makehuman4d, rig
 from facejax.data.meshes import Meshes, of_split
 from facejax.mesh import topology
@@ -68,8 +68,8 @@ def run(config: Config) -> dict[str, Any]:
             params, alpha = evaluation.fit_linear(model, train, **options)
             found = evaluation.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
             rows += _rows(level, name, found, {"alpha_mm2": alpha})
-        decode, steps = _decoder(config, level, train, plan, models, released)
-        rows += _rows(level, "s2d", evaluation.vertex_errors(decode, test, regions), {"steps": steps})
+        decode, training = _decoder(config, level, train, plan, models, released)
+        rows += _rows(level, "s2d", evaluation.vertex_errors(decode, test, regions), training)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     metrics = {"rows": rows}
     figure = _plot(config.out / "unseen_subjects.png", rows, config.levels)
@@ -80,12 +80,14 @@ def run(config: Config) -> dict[str, Any]:
 def _decoder(config: Config, level: int, train: Meshes, plan: fitting.DecoderPlan, models, released: int):
     if level == RELEASED_LEVEL and config.steps is None:
         hierarchy, params, steps = models.hierarchy, models.decoder, released
+        seconds = models.about["seconds"]["decoder"]
     else:
         shape = makehuman.template()
         hierarchy = jax.device_put(topology.build(shape.vertices, shape.faces, cache=cache.folder()))
-        params = fitting.fit_decoder(train, hierarchy, config.out / f"level{level}", plan=plan, seed=config.seed)
-        steps = plan.steps
-    return (lambda marks: decoder.apply(params, hierarchy, marks)), steps
+        folder = config.out / f"level{level}"
+        params = fitting.fit_decoder(train, hierarchy, folder, plan=plan, seed=config.seed)
+        steps, seconds = plan.steps, sum(entry["seconds"] for entry in journal.read(folder))
+    return (lambda marks: decoder.apply(params, hierarchy, marks)), {"steps": steps, "train_seconds": round(seconds, 1)}
 
 
 def _rows(level: int, method: str, found: dict[str, Any], more: dict[str, Any]) -> list[dict[str, Any]]:
