@@ -1,4 +1,4 @@
-"""Triangle meshes in PLY, OBJ, NPZ and NPY files.
+"""Triangle meshes in PLY, OBJ, GLB, NPZ and NPY files.
 
 Vertex order is kept exactly; polygons are cut into fans; everything but positions and faces is ignored. A
 file is a claim to be checked: counts are held against the bytes that are there before memory is taken, and
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax import files
-from facejax.io import ply
+from facejax.io import glb, ply
 
 LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
 _ARRAY_HEADERS = {
@@ -52,7 +52,9 @@ class Mesh(NamedTuple):
 
 
 def read(path: str | os.PathLike) -> Mesh:
-    """Reads a mesh by the file's suffix: .ply, .obj, .npz (`vertices`, optional `faces`) or .npy (vertices).
+    """Reads a mesh by the file's suffix: .ply, .obj, .glb, .npz (`vertices`, optional `faces`) or .npy (vertices).
+
+    Of a .glb, which counts in metres, the largest mesh is taken, at rest: see `facejax.io.glb`.
 
     Raises:
       MeshError: the file is missing, unreadable, cut short, empty or not a mesh; a vertex is not finite; a
@@ -249,5 +251,5 @@ def _write_npz(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     np.savez(path, vertices=vertices, faces=faces)
 
 
-_READERS = {".ply": ply.read, ".obj": _read_obj, ".npz": _read_npz, ".npy": _read_npy}
+_READERS = {".ply": ply.read, ".obj": _read_obj, ".glb": glb.read, ".npz": _read_npz, ".npy": _read_npy}
 _WRITERS = {".ply": ply.write, ".obj": _write_obj, ".npz": _write_npz}

@@ -162,7 +162,8 @@ BAD = {
     "none.obj": (b"# nothing\n", "holds no vertices"),
     "noise.npz": (b"PK\x03\x04", "noise.npz"),
     "noise.npy": (b"\x93NUMPY\x09\x00", "noise.npy"),
-    "mesh.stl": (b"solid", "unknown mesh format '.stl'"),
+    "noise.glb": (b"glTF\x02", "not a GLB"),
+    "mesh.stl": (b"solid", r"unknown mesh format '.stl'; expected \.ply, \.obj, \.glb, \.npz, \.npy"),
 }
 
 

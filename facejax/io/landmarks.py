@@ -1,0 +1,274 @@
+"""Landmarks of a mesh in the files that people have them in.
+
+  .json   `{"indices": [...]}` vertices from 0 on; `{"faces": [...], "weights": [[a, b, c], ...]}` barycentric, the
+          triangle's corners in order; `{"points": [[x, y, z], ...]}`; or a bare list of indices or of points. `names`
+          may stand beside them, other keys are passed over.
+  .pp     MeshLab's PickedPoints: XML, one `<point x= y= z= name= active=>` each.
+  .txt .csv .xyz .lnd .bnd   one landmark a line: `index`, `x y z`, or `index x y z` as in BU-4DFE, all lines alike;
+          blanks, commas or semicolons between, `#` begins a comment, blank lines are passed over.
+
+Landmarks are in the mesh's own unit. A file is a claim to be checked: sizes are bounded, and XML may declare nothing.
+"""
+
+import json
+import math
+import os
+import re
+from pathlib import Path
+from typing import NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+
+from facejax import files
+
+LIMIT = 2**22  # bytes of a file
+MOST = 10_000  # landmarks
+CLOSE = 1e-3  # of the mesh's diagonal: a vertex and the position written beside its number
+_KINDS = (("indices",), ("faces", "weights"), ("points",))
+_ROWS = {1: "index", 3: "x y z", 4: "index x y z"}
+
+
+class LandmarkError(ValueError):
+    """A landmark file cannot be used; the message names the file, the line or entry, and what was expected."""
+
+
+class Landmarks(NamedTuple):
+    """L landmarks of one mesh."""
+
+    points: np.ndarray  # (L, 3) float64, in the mesh's unit
+    index: np.ndarray | None  # (L,) int32, the vertex that each is; None where the file gives no vertices
+    names: tuple[str, ...] | None = None  # (L,)
+
+
+def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
+    """Reads the landmarks of a mesh by the file's suffix.
+
+    Args:
+      path: the file.
+      vertices: (N, 3) of the mesh; without them only files that hold positions can be read.
+      faces: (F, 3) of the mesh; barycentric landmarks need them.
+
+    Raises:
+      LandmarkError: the file is missing, too large or damaged; a number is not finite; an index is not of this mesh; a
+        position lies far off the mesh, or not at the vertex that is named beside it.
+    """
+    path = Path(path)
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise LandmarkError(f"{path}: unknown landmark format {path.suffix!r}; expected {', '.join(_READERS)}")
+    mesh = None if vertices is None else np.asarray(vertices, np.float64).reshape(-1, 3)
+    try:
+        if not path.is_file():
+            raise LandmarkError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        size = path.stat().st_size
+        if not 0 < size <= LIMIT:
+            raise LandmarkError(f"{path}: {size} bytes; expected 1 to {LIMIT}")
+        found = reader(path.read_bytes(), mesh, faces)
+        if mesh is not None:
+            _near(found.points, mesh)
+    except LandmarkError:
+        raise
+    except OSError as error:
+        raise LandmarkError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise LandmarkError(f"{path}: {error}") from error
+    return found
+
+
+def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> None:
+    """Writes vertex indices (L,) or positions (L, 3), and names if given, as .json, atomically; read back exactly.
+
+    Raises:
+      ValueError: another suffix, or not exactly one of the two, or a wrong shape.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".json":
+        raise ValueError(f"{path}: landmarks are written as .json, got {path.suffix!r}")
+    if (index is None) == (points is None):
+        raise ValueError(f"{path}: expected either index or points")
+    if points is None:
+        values = np.asarray(index)
+        if values.ndim != 1 or not len(values) or values.dtype.kind not in "iu" or values.min() < 0:
+            raise ValueError(f"{path}: index must be (L,) integers from 0 on, got {values.shape} {values.dtype}")
+    else:
+        values = np.asarray(points, np.float64)
+        if values.ndim != 2 or values.shape[1] != 3 or not len(values) or not np.isfinite(values).all():
+            raise ValueError(f"{path}: points must be (L, 3) and finite, got {values.shape}")
+    record = {"indices" if points is None else "points": values.tolist()}
+    if names is not None:
+        record["names"] = _names(list(names), len(values))
+    with files.replacing(path) as temporary:
+        temporary.write_text(json.dumps(record), encoding="utf-8")
+
+
+def _read_json(data: bytes, mesh, faces) -> Landmarks:
+    try:
+        record = json.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise ValueError("is not UTF-8 text") from None
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"is not JSON: {error}") from None
+    if isinstance(record, list):
+        record = {"points" if record and isinstance(record[0], list) else "indices": record}
+    kinds = [kind for kind in _KINDS if isinstance(record, dict) and any(key in record for key in kind)]
+    if len(kinds) != 1 or not all(key in record for key in kinds[0]):
+        keys = sorted(map(str, record))[:8] if isinstance(record, dict) else type(record).__name__
+        raise ValueError(f'expected "indices", or "faces" and "weights", or "points", got {keys}')
+    rows = [_list(record[key], key) for key in kinds[0]]
+    if kinds[0] == ("indices",):
+        index = np.array([_index(v, f"indices[{i}]", mesh) for i, v in enumerate(rows[0])], np.int32)
+        found = Landmarks(mesh[index], index)
+    elif kinds[0] == ("points",):
+        points = [_numbers(v, f"points[{i}]") for i, v in enumerate(rows[0])]
+        found = Landmarks(np.array(points, np.float64), None)
+    else:
+        found = Landmarks(_on_faces(*rows, mesh, faces), None)
+    if "names" in record:
+        found = found._replace(names=tuple(_names(record["names"], len(found.points))))
+    return found
+
+
+def _on_faces(face: list, weights: list, mesh, faces) -> np.ndarray:
+    """Positions (L, 3) of barycentric landmarks."""
+    if mesh is None or faces is None:
+        raise ValueError("landmarks on faces need the mesh's vertices and faces")
+    if len(face) != len(weights):
+        raise ValueError(f"{len(face)} faces but {len(weights)} weights")
+    faces = np.asarray(faces)
+    which = [_whole(v, f"faces[{i}]", len(faces), "triangles") for i, v in enumerate(face)]
+    table = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(weights)], np.float64)
+    bad = np.flatnonzero(np.abs(table.sum(1) - 1) > 1e-3)
+    if len(bad):
+        raise ValueError(f"weights[{bad[0]}]: expected a sum of 1, got {table[bad[0]].tolist()}")
+    return np.einsum("lk,lkx->lx", table, mesh[faces[which]])
+
+
+def _read_pp(data: bytes, mesh, faces) -> Landmarks:
+    parser = expat.ParserCreate()
+    tags, points, names = set(), [], []
+
+    def start(tag, attributes):
+        line = f"line {parser.CurrentLineNumber}"
+        if not tags and tag != "PickedPoints":
+            raise ValueError(f"{line}: expected PickedPoints, got {tag[:40]!r}")
+        tags.add(tag)
+        if tag != "point":
+            return
+        name = attributes.get("name", str(len(points)))
+        # MeshLab keeps a point that was named but not picked; leaving it out would renumber all that follow.
+        if attributes.get("active", "1") == "0":
+            raise ValueError(f"{line}: point {name[:40]!r} is not active: pick it, or delete it")
+        missing = [axis for axis in "xyz" if axis not in attributes]
+        if missing:
+            raise ValueError(f"{line}: point {name[:40]!r} lacks {missing[0]}")
+        points.append([_number(attributes[axis], line) for axis in "xyz"])
+        names.append(name)
+
+    # MeshLab itself begins with a bare <!DOCTYPE PickedPoints>. Anything that a declaration could bring along (entities
+    # to expand, files to fetch) is refused.
+    def doctype(name, system, public, has_subset):
+        if system or public or has_subset:
+            raise ValueError(f"line {parser.CurrentLineNumber}: a DOCTYPE with declarations is refused")
+
+    def entity(*_):
+        raise ValueError(f"line {parser.CurrentLineNumber}: entities are refused")
+
+    parser.StartElementHandler, parser.StartDoctypeDeclHandler, parser.EntityDeclHandler = start, doctype, entity
+    try:
+        parser.Parse(data, True)
+    except (expat.ExpatError, LookupError) as error:
+        raise ValueError(f"is not XML: {error}") from None
+    return Landmarks(np.array(_list(points, "points"), np.float64), None, tuple(names))
+
+
+def _read_text(data: bytes, mesh, faces) -> Landmarks:
+    index, points, form = [], [], None
+    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").splitlines(), 1):
+        words = [word for word in re.split(r"[\s,;]+", line.partition("#")[0]) if word]
+        if not words:
+            continue
+        where = f"line {number}"
+        form = len(words) if form is None else form
+        if len(words) != form or form not in _ROWS:
+            wanted = f"`{_ROWS[form]}` as before" if form in _ROWS else ", ".join(f"`{row}`" for row in _ROWS.values())
+            raise ValueError(f"{where}: expected {wanted}, got {len(words)} columns: {line.strip()[:60]!r}")
+        if form != 3:
+            if not re.fullmatch(r"[0-9]{1,9}", words[0]):
+                raise ValueError(f"{where}: expected a vertex's number from 0 on, got {words[0][:40]!r}")
+            index.append(_index(int(words[0]), where, mesh) if form == 1 or mesh is not None else int(words[0]))
+        if form != 1:
+            points.append([_number(word, where) for word in words[-3:]])
+            if form == 4 and mesh is not None and math.dist(points[-1], mesh[index[-1]]) > CLOSE * _diagonal(mesh):
+                raise ValueError(
+                    f"{where}: vertex {index[-1]} lies at {mesh[index[-1]].tolist()}, not at {points[-1]}: these are "
+                    "landmarks of another mesh"
+                )
+        if max(len(index), len(points)) > MOST:
+            raise ValueError(f"{where}: more than {MOST} landmarks")
+    _list(index or points, "landmarks")
+    numbers = np.array(index, np.int32) if index else None
+    return Landmarks(np.array(points, np.float64) if points else mesh[numbers], numbers)
+
+
+def _list(values, what: str) -> list:
+    if not isinstance(values, list) or not 0 < len(values) <= MOST:
+        got = f"{len(values)}" if isinstance(values, list) else type(values).__name__
+        raise ValueError(f"{what}: expected a list of 1 to {MOST} landmarks, got {got}")
+    return values
+
+
+def _names(values, count: int) -> list[str]:
+    if not isinstance(values, list) or len(values) != count or not all(isinstance(v, str) for v in values):
+        raise ValueError(f"names: expected {count} texts, one for each landmark")
+    return values
+
+
+def _whole(value, where: str, count: int, what: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{where}: expected a whole number, got {str(value)[:40]!r}")
+    if not 0 <= value < count:
+        raise ValueError(f"{where}: {str(value)[:40]} is out of range; {what} are 0..{count - 1}")
+    return value
+
+
+def _index(value, where: str, mesh) -> int:
+    if mesh is None:
+        raise ValueError("landmarks given as vertices need the mesh's vertices")
+    return _whole(value, where, len(mesh), "vertices")
+
+
+def _numbers(value, where: str) -> list[float]:
+    if not isinstance(value, list) or len(value) != 3:
+        raise ValueError(f"{where}: expected 3 numbers, got {str(value)[:60]!r}")
+    return [_number(v, where) for v in value]
+
+
+def _number(value, where: str) -> float:
+    try:
+        number = math.nan if isinstance(value, (bool, list, dict)) or value is None else float(value)
+    except (ValueError, OverflowError):
+        number = math.nan
+    # Half of the greatest number, so that distances stay finite.
+    if not abs(number) < 1e150:
+        raise ValueError(f"{where}: expected a finite number, got {str(value)[:40]!r}")
+    return number
+
+
+def _near(points: np.ndarray, mesh: np.ndarray) -> None:
+    middle, diagonal = (mesh.min(0) + mesh.max(0)) / 2, _diagonal(mesh)
+    distance = np.linalg.norm(points - middle, axis=1)
+    far = int(np.argmax(distance))
+    if distance[far] > max(diagonal, 1e-12):
+        raise ValueError(
+            f"landmark {far} lies {distance[far]:.3g} from the middle of a mesh whose diagonal is {diagonal:.3g}: "
+            "another unit, or another mesh?"
+        )
+
+
+def _diagonal(mesh: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(mesh, axis=0)))
+
+
+_TEXTS = (".txt", ".csv", ".xyz", ".lnd", ".bnd")
+_READERS = {".json": _read_json, ".pp": _read_pp} | dict.fromkeys(_TEXTS, _read_text)

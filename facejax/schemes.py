@@ -1,0 +1,160 @@
+"""Which landmark is which: schemes of 68, 51 and 83 points, and what any two of them share.
+
+Every point of a scheme has an anatomical name, and points of two schemes correspond when their names are equal.
+Left and right are the subject's, whatever the source calls them.
+
+  68   iBUG 300-W, after Multi-PIE.
+  51   the same without the 17 of the jaw.
+  83   BU-3DFE and BU-4DFE (Binghamton), the order of their .bnd files.
+
+BU-3DFE's order is not published as a list. Deep-MVLM's notes on the database (docs/BU-3DFE_landmark_info.txt) name 19
+of the 83: eye corners and lids, alae, subnasale, the corners and middles of the lips, the chin. menpo's
+`face_bu3dfe_83` gives the groups and the sides; what the database calls the left eye lies at the left of the
+picture and is the subject's right. The rest, direction included, is read off the points that Deep-MVLM's network for
+this scheme places on a freely licensed head (assets/test2_bu3dfe.txt of cvjena/mvlm), beside 68 points on the same
+head. Inferred only: the contour, of which but the chin's number is documented, and how far apart its points are.
+
+How close points of one name are between 68 and 83: corners of eyes and lips coincide. Lids have two points at
+thirds against three at quarters, brows one line against a closed outline, whose upper edge is taken, and the alae
+are clicked further out in 83: a few millimetres. The 83 know no bridge, tip or base of the nose; the contours of
+both run along the jaw at other intervals and share the chin alone.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+GROUPS = ("jaw", "brows", "nose", "eyes", "lips")
+# Brows count from the nose, jaw and contour from the chin, lips from the middle.
+_OUTER_LIP = (
+    "right lip corner",
+    "right upper lip 2",
+    "right upper lip 1",
+    "upper lip",
+    "left upper lip 1",
+    "left upper lip 2",
+    "left lip corner",
+    "left lower lip 2",
+    "left lower lip 1",
+    "lower lip",
+    "right lower lip 1",
+    "right lower lip 2",
+)
+_INNER_LIP = (
+    "right inner lip corner",
+    "right inner upper lip",
+    "inner upper lip",
+    "left inner upper lip",
+    "left inner lip corner",
+    "left inner lower lip",
+    "inner lower lip",
+    "right inner lower lip",
+)
+# From the outer corner of the right eye and from the inner corner of the left: clockwise in a picture of the face.
+_RIGHT_EYE = ("outer corner", "upper outer", "upper inner", "inner corner", "lower inner", "lower outer")
+_LEFT_EYE = ("inner corner", "upper inner", "upper outer", "outer corner", "lower outer", "lower inner")
+_IBUG = (
+    *(f"right jaw {i}" for i in range(8, 0, -1)),
+    "chin",
+    *(f"left jaw {i}" for i in range(1, 9)),
+    *(f"right brow {i}" for i in range(5, 0, -1)),
+    *(f"left brow {i}" for i in range(1, 6)),
+    "nose bridge 1",
+    "nose bridge 2",
+    "nose bridge 3",
+    "nose tip",
+    "right nose wing",
+    "right nose nostril",
+    "nose base",
+    "left nose nostril",
+    "left nose wing",
+    *(f"right eye {place}" for place in _RIGHT_EYE),
+    *(f"left eye {place}" for place in _LEFT_EYE),
+    *_OUTER_LIP,
+    *_INNER_LIP,
+)
+# Both eyes and both brows run from the inner end over the upper edge to the outer end and back below: mirror images.
+_BU_EYE = (
+    "inner corner",
+    "upper inner",
+    "upper middle",
+    "upper outer",
+    "outer corner",
+    "lower outer",
+    "lower middle",
+    "lower inner",
+)
+_BU_BROW = ("1", "2", "3", "4", "5", "lower 5", "lower 4", "lower 3", "lower 2", "lower 1")
+_BU_NOSE = ("side 1", "side 2", "side 3", "wing", "rim", "nostril")  # from the eye down and to the middle
+_BU = (
+    *(f"right eye {place}" for place in _BU_EYE),
+    *(f"left eye {place}" for place in _BU_EYE),
+    *(f"right brow {place}" for place in _BU_BROW),
+    *(f"left brow {place}" for place in _BU_BROW),
+    *(f"right nose {place}" for place in _BU_NOSE),
+    *(f"left nose {place}" for place in reversed(_BU_NOSE)),
+    *_OUTER_LIP,
+    *_INNER_LIP,
+    *(f"right contour {i}" for i in range(7, 0, -1)),
+    "chin",
+    *(f"left contour {i}" for i in range(1, 8)),
+)
+_WORDS = {"jaw": ("jaw", "chin", "contour"), "brows": ("brow",), "nose": ("nose",), "eyes": ("eye",), "lips": ("lip",)}
+
+
+class Scheme(NamedTuple):
+    """L landmarks in order."""
+
+    name: str
+    points: tuple[str, ...]  # (L,) anatomical names, no two alike
+    groups: dict[str, np.ndarray]  # each of `GROUPS` -> (n,) int32; empty where a scheme has none
+    mirror: np.ndarray  # (L,) int32: where the point of the other side stands; one of the middle gives itself
+
+
+def by_count(count: int) -> Scheme:
+    """The scheme of so many landmarks. Raises `ValueError` that names the known counts for any other."""
+    if count not in _SCHEMES:
+        raise ValueError(f"no scheme of {count} landmarks is known; known are {', '.join(map(str, _SCHEMES))}")
+    return _build(count)
+
+
+def common(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (C,) into the scheme of `source` landmarks and (C,) into that of `target`, of the points they share.
+
+    In the source's order. 68 and 51 share 51; 68 and 83 share 47, 51 and 83 share 46.
+
+    Raises:
+      ValueError: one of the counts is of no known scheme.
+    """
+    first, second = by_count(source), by_count(target)
+    there = {point: i for i, point in enumerate(second.points)}
+    pairs = [(i, there[point]) for i, point in enumerate(first.points) if point in there]
+    index = np.array(pairs, np.int32)
+    return index[:, 0], index[:, 1]
+
+
+def other_side(point: str) -> str:
+    """The name of a point's mirror image."""
+    side, _, rest = point.partition(" ")
+    return {"left": f"right {rest}", "right": f"left {rest}"}.get(side, point)
+
+
+@functools.cache
+def _build(count: int) -> Scheme:
+    name, points = _SCHEMES[count]
+    words = [set(point.split()) for point in points]
+    groups = {group: _index(i for i, w in enumerate(words) if w & set(_WORDS[group])) for group in GROUPS}
+    return Scheme(name, points, groups, _index(points.index(other_side(point)) for point in points))
+
+
+def _index(values) -> np.ndarray:
+    # Cached and handed to everybody: nobody may change it.
+    index = np.fromiter(values, np.int32)
+    index.flags.writeable = False
+    return index
+
+
+_SCHEMES = {51: ("iBUG without jaw", _IBUG[17:]), 68: ("iBUG", _IBUG), 83: ("BU-3DFE", _BU)}
