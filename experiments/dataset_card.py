@@ -23,9 +23,9 @@ from PIL import Image
 
 from experiments import _run
 from facejax import evaluation, files
-from facejax.data import assets, contact, makehuman, makehuman4d, performance, rig, store
+from facejax.data import makehuman, makehuman4d, performance, portrait, rig, store
 from facejax.data.meshes import of_split
-from facejax.io import dress, props, render, scene
+from facejax.io import render
 from facejax.models import linear
 
 matplotlib.use("Agg")
@@ -170,23 +170,10 @@ def _ladder(path: Path, config: Config) -> None:
 
 def _portrait(vertices: np.ndarray) -> np.ndarray:
     """A picture of a posed head (M, 3) with its own eyes and teeth."""
-    loaded = assets.load()
-    parts = []
-    for name, triangles in loaded.prop_faces.items():
-        if name.endswith("eye"):
-            centre, radius = contact.fit_sphere(vertices[np.unique(triangles)].astype(np.float64))
-            parts.append(props.eyeball(centre - [0, 0, 0.3], radius - 0.5, iris_radius=0.4 * radius))
-        else:
-            colour = props.TONGUE if "tongue" in name else props.TEETH
-            used, local = np.unique(triangles, return_inverse=True)
-            local = local.reshape(-1, 3)
-            if "teeth" in name:
-                shown, local = dress.front(loaded.base[used], local)
-                used = used[shown]
-            parts.append(scene.Part(vertices[used], local, colour, 0.6))
-    skin = vertices[: loaded.skin]
-    camera = render.aim(makehuman.template().vertices * 1.08, size=PICTURE, turn=18)
-    return render.image(skin, loaded.faces, size=PICTURE, camera=camera, extras=parts)
+    shape = makehuman.template()
+    camera = render.aim(shape.vertices * 1.08, size=PICTURE, turn=18)
+    skin, parts = vertices[None, : len(shape.vertices)], portrait.parts(vertices[None])
+    return render.frames(skin, shape.faces, size=PICTURE, camera=camera, extras=parts)[0]
 
 
 def _save(path: Path, pixels: np.ndarray) -> None:

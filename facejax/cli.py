@@ -1,4 +1,4 @@
-"""The command line: `facejax generate | demo | labels | data | view`. A thin skin over the library.
+"""The command line: `facejax generate | animate | demo | labels | data | view`. A thin skin over the library.
 
 Bad input ends with one line on standard error, exit code 2, and nothing written.
 """
@@ -44,6 +44,58 @@ class Generate:
     """Frames per second of the results."""
     intensity: float = 1.0
     """Scale of the motion, 0 to 2."""
+    formats: tuple[Format, ...] = ("glb", "html", "webp")
+    """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Animate:
+    """Animate any mesh through its landmarks: by an expression network, by transitions, or by a recording."""
+
+    out: Path
+    """Folder for the results; made if it is missing."""
+    mesh: Path | None = None
+    """Any face or head (PLY, OBJ, GLB, NPZ), in any topology, unit and pose. Default: a MakeHuman face."""
+    landmarks: Path | None = None
+    """Its 68, 51 or 83 landmarks: JSON of vertices or positions, MeshLab .pp, or plain text."""
+    expression: str | None = None
+    """Driven by an expression network: anger, disgust, fear, happiness, sadness or surprise."""
+    end: str | None = None
+    """Driven by generated transitions: the expression to arrive at; `facejax labels` lists them."""
+    start: str = "neutral"
+    """With --end: the expression to start from."""
+    then: UseAppendAction[tuple[str, ...]] = ()
+    """With --end: a further expression; repeat the flag."""
+    livelink: Path | None = None
+    """Driven by a recording of Live Link Face (CSV)."""
+    begin: float = 0.0
+    """With --livelink: seconds into the recording."""
+    seconds: float = 10.0
+    """With --livelink: how much of it."""
+    keep_rest: bool = False
+    """With --livelink: take the weights as they are, not relative to the person's resting face."""
+    person: int | None = None
+    """Without --mesh: which MakeHuman person (100 to 119 are test subjects). Default: the average face."""
+    frames: int | None = None
+    """Frames of each transition (30), or at most of an expression."""
+    whole: bool = False
+    """With --expression: go on to the last frame, though the expression is over."""
+    seed: int = 7
+    """With --end: another seed, another motion."""
+    weights: Path | None = None
+    """Weights to use in place of the released ones."""
+    kernel: str | None = None
+    """Radial basis function: gaussian, multiquadric, thin_plate, triharmonic or wendland_c2."""
+    sigma: float | None = None
+    """Width of the kernel, in spacings of the landmarks."""
+    smoothing: float = 0.0
+    """Above 0, noisy landmarks need not be met exactly."""
+    pin: bool = True
+    """Hold rims still that are far from every landmark, such as the neck's."""
+    intensity: float = 1.0
+    """Scale of the motion, 0 to 2."""
+    fps: float | None = None
+    """Frames per second of the results; as the motion was made by default."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
     """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
 
@@ -102,6 +154,7 @@ class View:
 
 Command = (
     Annotated[Generate, subcommand("generate", prefix_name=False)]
+    | Annotated[Animate, subcommand("animate", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Labels, subcommand("labels", prefix_name=False)]
     | Annotated[Data, subcommand("data", prefix_name=False)]
@@ -138,6 +191,49 @@ def _generate(command: Generate) -> None:
     print("\n".join(str(path) for path in done))
 
 
+def _animate(command: Animate) -> None:
+    from facejax import drive, produce
+    from facejax.data import makehuman
+
+    drivers = ("expression", "end", "livelink")
+    named = [f"--{name}" for name in drivers if getattr(command, name) is not None]
+    if len(named) != 1:
+        raise ValueError(
+            f"animate: expected one of --expression, --end and --livelink, got {' and '.join(named) or 'none'}"
+        )
+    if command.mesh is None and command.landmarks is not None:
+        raise ValueError(f"--landmarks {command.landmarks}: of which mesh? name it with --mesh")
+    person = makehuman.average() if command.person is None else makehuman.subject(command.person)
+    shown = {"fps": command.fps, "formats": command.formats}
+    if command.livelink is not None:
+        recording = drive.read_recording(
+            command.livelink, begin=command.begin, seconds=command.seconds, at_rest=not command.keep_rest
+        )
+        name = command.livelink.stem
+        if command.mesh is None:
+            return _said(produce.play(recording, person, name, command.out, intensity=command.intensity, **shown))
+        motion = drive.by_recording(recording, name=name)
+    elif command.expression is not None:
+        motion = drive.by_expression(
+            command.expression, frames=command.frames, whole=command.whole, weights=command.weights
+        )
+    else:
+        labels = (command.start, command.end, *command.then)
+        motion = drive.by_labels(labels, seed=command.seed, frames=command.frames or 30, weights=command.weights)
+    options = {"pin": command.pin, "sigma": command.sigma, "smoothing": command.smoothing, **shown}
+    options |= {} if command.kernel is None else {"kernel": command.kernel}
+    source = {"mesh": command.mesh, "landmarks": command.landmarks, "person": person}
+    _said(produce.animate(motion, command.out, **source, intensity=command.intensity, **options))
+
+
+def _said(result: tuple[list[Path], tuple[str, ...]]) -> None:
+    """Print what was assumed to standard error, and the files to standard output."""
+    done, notes = result
+    for note in notes:
+        print(note, file=sys.stderr)
+    print("\n".join(str(path) for path in done))
+
+
 def _demo(command: Demo) -> None:
     from facejax import demo
 
@@ -170,7 +266,7 @@ def _view(command: View) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
-_COMMANDS = {Generate: _generate, Demo: _demo, Labels: _labels, Data: _data, View: _view}
+_COMMANDS = {Generate: _generate, Animate: _animate, Demo: _demo, Labels: _labels, Data: _data, View: _view}
 
 
 if __name__ == "__main__":

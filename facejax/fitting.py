@@ -6,18 +6,16 @@ Both functions keep their run in a folder (metrics, checkpoints) and go on from 
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from facejax import files, losses, steps, training
+from facejax import journal, losses, steps, training
 from facejax.data import motions, store
 from facejax.data.meshes import Meshes
 from facejax.geometry import sphere, srvf
@@ -74,7 +72,7 @@ def fit_motion(
     config = config._replace(labels=labels, steps=examples.curves.shape[1] - 1, landmarks=examples.curves.shape[2])
     chart, values = chart_of(examples, config)
     digest = hashlib.sha256(np.ascontiguousarray(examples.curves)).hexdigest()
-    _claim(folder, {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest})
+    journal.claim(folder, {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest})
     generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
     players = steps.Players(
         motion.generator.init(generator_key, chart, config=config).weights,
@@ -134,7 +132,7 @@ def fit_decoder(
     """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole."""
     data = meshes.data
     chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
-    _claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
+    journal.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
     template = np.asarray(data.neutral[np.unique(meshes.owner)], np.float64).mean(axis=0)
     weights = losses.landmark_weights(
         jnp.asarray(template, jnp.float32), jnp.asarray(data.landmark_index), mode=plan.weighting,
@@ -164,23 +162,6 @@ def fit_decoder(
         chunk=50,
     )
     return decoder.Params(scale, state.params)
-
-
-def _claim(folder: str | os.PathLike, what: dict[str, Any]) -> None:
-    """Write down what a run folder is for; raise `ValueError` where it holds a run of something else.
-
-    A checkpoint of the right shapes would else be resumed with another seed, plan or dataset.
-    """
-    path = Path(folder) / "run.json"
-    what = json.loads(json.dumps(what))
-    if path.exists():
-        before = json.loads(path.read_text())
-        differs = sorted(name for name in what.keys() | before.keys() if what.get(name) != before.get(name))
-        if differs:
-            raise ValueError(f"{folder} holds a run with another {', '.join(differs)}: name another folder")
-        return
-    with files.replacing(path) as temporary:
-        temporary.write_text(json.dumps(what, indent=1) + "\n")
 
 
 def mesh_batches(meshes: Meshes, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:

@@ -5,6 +5,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -79,6 +80,23 @@ def read(folder: str | os.PathLike) -> list[dict[str, float]]:
         except json.JSONDecodeError:
             break
     return entries
+
+
+def claim(folder: str | os.PathLike, what: dict[str, Any]) -> None:
+    """Write down what a run folder is for; raise `ValueError` where it holds a run of something else.
+
+    A checkpoint of the right shapes would else be resumed with another seed, plan or dataset.
+    """
+    path = Path(folder) / "run.json"
+    what = json.loads(json.dumps(what))
+    if path.exists():
+        before = json.loads(path.read_text())
+        differs = sorted(name for name in what.keys() | before.keys() if what.get(name) != before.get(name))
+        if differs:
+            raise ValueError(f"{folder} holds a run with another {', '.join(differs)}: name another folder")
+        return
+    with files.replacing(path) as temporary:
+        temporary.write_text(json.dumps(what, indent=1) + "\n")
 
 
 def _truncate(path: Path, done: int) -> None:

@@ -1,4 +1,4 @@
-"""Losses of the two networks: Wasserstein with gradient penalty for motion, displacement L1 for meshes.
+"""Losses: Wasserstein with gradient penalty for motion, displacement L1 for meshes, steps of expression networks.
 
 Vocabulary: a *sample* is any pytree of arrays; a *condition* is what both players of the game are told
 about it (here: the two labels). `score(sample, condition)` judges ONE sample and returns a scalar. Mesh
@@ -14,6 +14,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from facejax.geometry.sphere import root
 
 Sample = Any
 Condition = Any
@@ -153,6 +155,60 @@ def landmark_weights(
     if edge_length is None:
         raise ValueError("mode 'inverse' needs edge_length, the mean edge length of the mesh")
     return edge_length / jnp.maximum(distance, edge_length)
+
+
+@jax.jit
+def next_step(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean squared error of steps (..., T, L, 3) over the entries where the mask (..., T) is set.
+
+    Seo and Luo 2021, L_disp: a sum in the formula, a mean in the text; the mean here. An empty mask gives 0.
+    """
+    _same_steps(predicted, target, mask)
+    error = jnp.mean(jnp.square(predicted - target), axis=(-2, -1))
+    return _masked_mean(error, mask)
+
+
+@jax.jit
+def path(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean distance of the landmarks that steps (..., T, L, 3) lead to, over frames where the mask (..., T) is set.
+
+    Errors of single steps add up along the way; this measures where the face has got to. A distance, not its square:
+    the best single path is then the median of many, which is the path of somebody where the mean is nobody's.
+    """
+    _same_steps(predicted, target, mask)
+    missed = jnp.cumsum(jnp.where(mask[..., None, None], predicted - target, 0), axis=-3)
+    return _masked_mean(jnp.mean(root(jnp.sum(jnp.square(missed), axis=-1)), axis=-1), mask)
+
+
+@jax.jit
+def strength(steps: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean squares of steps (..., T, L, 3) and of their differences in time, (2,), where the mask (..., T) is set."""
+    _same_steps(steps, steps, mask)
+    parts = ((steps, mask), (jnp.diff(steps, axis=-3), mask[..., 1:] & mask[..., :-1]))
+    return jnp.stack([_masked_mean(jnp.mean(jnp.square(values), axis=(-2, -1)), where) for values, where in parts])
+
+
+@jax.jit
+def energy(predicted: jax.Array, mask: jax.Array, wanted: jax.Array) -> jax.Array:
+    """How far motion is from the strength that it should have, whatever its direction.
+
+    (r - 1)^2 for r the ratio of root mean squares, of steps (..., T, L, 3) and of their differences, both over all
+    sequences where the mask (..., T) is set; `wanted` (2,) is the `strength` of the training set. A network that cannot
+    know what comes next predicts the mean of all possibilities, which moves less than any of them. An empty mask
+    gives 0.
+    """
+    ratio = root(strength(predicted, mask) / wanted)
+    return jnp.where(jnp.any(mask), jnp.sum(jnp.square(ratio - 1)), 0)
+
+
+def _masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
+    return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(jnp.sum(mask), 1)
+
+
+def _same_steps(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> None:
+    _same_shape(predicted, target)
+    if predicted.ndim < 3 or mask.shape != predicted.shape[:-2]:
+        raise ValueError(f"mask must have shape {predicted.shape[:-2]}, one per frame of steps; got {mask.shape}")
 
 
 def _same_shape(predicted: jax.Array, target: jax.Array) -> None:

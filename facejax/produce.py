@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import io, pipeline, results
-from facejax.data import assets, makehuman, makehuman4d, noise
-from facejax.io import faces
+from facejax import animation, drive, files, io, pipeline, results
+from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait
+from facejax.io import dress, faces
 
 
 def generate(
@@ -117,3 +117,93 @@ def _animation(path: Path) -> tuple[np.ndarray, np.ndarray, dict]:
             raise ValueError(f"{path}: has no triangles, nothing to show")
         return mesh.vertices, mesh.faces, {}
     return io.meshes.read_animation(path)
+
+
+def animate(
+    motion: drive.Motion,
+    out: Path,
+    *,
+    mesh: Path | None = None,
+    landmarks: Path | None = None,
+    person: makehuman.Subject | None = None,
+    intensity: float = 1.0,
+    fps: float | None = None,
+    formats: Sequence[str] = ("glb", "html", "webp"),
+    **options,
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Put a motion on a mesh with its landmarks, or on a MakeHuman person; the files, and what was assumed.
+
+    `options` go to `animation.prepare` (pin, kernel, sigma, smoothing).
+    """
+    results.compile_cache()
+    results.check_formats(formats)
+    rate = motion.fps if fps is None else fps
+    results.check_rate(rate)
+    shape = makehuman.template()
+    template = shape.vertices[shape.landmarks]
+    name = person.name if mesh is None else str(mesh)
+    vertices, triangles, marks = _mesh(mesh, landmarks, person)
+    face = animation.prepare(vertices, triangles, marks, template, name=name, **options)
+    moved = np.asarray(animation.move(face, motion.curve, intensity=intensity))
+    marks = np.asarray(animation.landmarks_of(face, motion.curve, intensity=intensity))
+    extras = ()
+    if len(face.landmarks) == dress.IBUG and dress.has_eye_holes(face.vertices, face.faces, face.landmarks):
+        extras = dress.parts(dress.Props(template, *makehuman.template_props()), face.landmarks, marks)
+    shot = io.scene.make(moved, face.faces, captions=motion.captions, landmarks=marks, extras=extras)
+    stem = f"{person.name if mesh is None else mesh.stem}-{results.stem([motion.name])}"
+    return _write(out, stem, shot, rate, formats), motion.notes + face.notes
+
+
+def play(
+    recording: livelink.Recording,
+    person: makehuman.Subject,
+    name: str,
+    out: Path,
+    *,
+    intensity: float = 1.0,
+    fps: float | None = None,
+    formats: Sequence[str] = ("glb", "html", "webp"),
+) -> tuple[list[Path], tuple[str, ...]]:
+    """A recording on a MakeHuman person, by its own blendshapes; the files, and what was assumed."""
+    rate = drive.rate_of(recording) if fps is None else fps
+    results.check_formats(formats)
+    results.check_rate(rate)
+    animation.check_intensity(intensity)
+    shape = makehuman.template()
+    posed = drive.posed(recording, person, intensity=intensity)
+    skin = posed[:, : len(shape.vertices)]
+    parts, marks = portrait.parts(posed), skin[:, shape.landmarks]
+    shot = io.scene.make(skin, shape.faces, captions=((0, name),), landmarks=marks, extras=parts)
+    return _write(out, f"{person.name}-{name}", shot, rate, formats), recording.notes
+
+
+def _mesh(mesh: Path | None, landmarks: Path | None, person: makehuman.Subject | None):
+    """Vertices, triangles and landmarks (L, 3) to be moved."""
+    shape = makehuman.template()
+    if mesh is None:
+        return person.vertices, shape.faces, person.vertices[shape.landmarks]
+    found = io.load_mesh(mesh)
+    if found.faces is None:
+        raise ValueError(f"{mesh}: has no triangles, nothing to move")
+    if landmarks is not None:
+        return found.vertices, found.faces, io.landmarks.read(landmarks, found.vertices, found.faces).points
+    if len(found.vertices) != len(shape.vertices):
+        raise ValueError(
+            f"{mesh}: --landmarks is missing; only MakeHuman's head, {len(shape.vertices)} vertices, goes without"
+        )
+    return found.vertices, found.faces, found.vertices[shape.landmarks]
+
+
+def _write(out: Path, stem: str, shot: io.scene.Scene, rate: float, formats: Sequence[str]) -> list[Path]:
+    results.writable(out)
+    written = []
+    with results.progress("writing", len(formats) + 1) as advance:
+        for suffix in formats:
+            written.append(results.save(out, stem, suffix, shot, rate))
+            advance()
+        path = out / f"{stem}-landmarks.npz"
+        with files.replacing(path) as temporary:
+            np.savez(temporary, landmarks=shot.landmarks, fps=np.float64(rate))
+        written.append(path)
+        advance()
+    return written

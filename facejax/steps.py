@@ -4,7 +4,7 @@ Each maker takes functions and returns `step(state, batch, constants) -> (state,
 model.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -40,6 +40,40 @@ def supervised(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
 def start_supervised(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
     """The state that `supervised` starts from."""
     return TrainState(jnp.int32(0), params, optimiser.init(params), key)
+
+
+def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
+    """One step of E models that know nothing of each other: parameters, optimiser states, batches stacked, (E, ...).
+
+    `step` sees one of them, with constants (own, shared) of which `own` comes stacked too, and a key made of the run's
+    and its id: the same numbers alone as in company. Metrics are means over the models; the loss by name as well.
+
+    On a CPU the models take turns within the step: six networks of three layers of 128 took 106 ms so, and 135 ms
+    under `vmap`, whose batched small products run through no fast kernel. Elsewhere it is a `vmap`.
+    """
+
+    def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
+        own, shared = constants
+
+        def one(parts):
+            params, opt_state, extra, number, batch, own = parts
+            key = jax.random.fold_in(state.key, number)
+            found, metrics = step(TrainState(state.step, params, opt_state, key, extra), batch, (own, shared))
+            return (found.params, found.opt_state, found.extra), metrics
+
+        stacked = (state.params, state.opt_state, state.extra, jnp.asarray(ids), batch, own)
+        turns = jax.default_backend() == "cpu"
+        (params, opt_state, extra), metrics = jax.lax.map(one, stacked) if turns else jax.vmap(one)(stacked)
+        means = {name: jnp.mean(values) for name, values in metrics.items()}
+        losses = {f"loss_{name}": metrics["loss"][i] for i, name in enumerate(names)} if len(names) > 1 else {}
+        return TrainState(state.step + 1, params, opt_state, state.key, extra), means | losses
+
+    return stepped
+
+
+def start_side_by_side(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
+    """The state that `side_by_side` of `supervised` steps starts from; every leaf of `params` is stacked, (E, ...)."""
+    return TrainState(jnp.int32(0), params, jax.vmap(optimiser.init)(params), key)
 
 
 def adversarial(

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments import classification, dataset_card, motion_quality, pretrain, unseen_subjects
+from experiments import classification, dataset_card, motion_quality, pretrain, rbf_warp, unseen_subjects
 from facejax import evaluation
 
 TINY = {"subjects": 6, "meshes": 260}
@@ -53,6 +53,17 @@ def test_pretrain(own_cache, tmp_path):
     metrics = check(tmp_path / "o", "error_mm", "seconds")
     assert metrics["error_mm"]["face"] > 0
     assert (tmp_path / "o" / "makehuman4d.safetensors").stat().st_size < 25e6
+
+
+def test_rbf_warp(own_cache, tmp_path):
+    rbf_warp.run(rbf_warp.Config(out=tmp_path / "o", level=1, frames=10, quick=True, **TINY))
+    metrics = check(tmp_path / "o", "chosen", "still", "test", "validation", "per_frame", "remeshed")
+    errors = {(r["kernel"], r["affine"], r["lips"]): r["error_mm"]["face"] for r in metrics["test"] if r["falloff"]}
+    assert max(errors.values()) < metrics["still"]["face"]
+    assert metrics["remeshed"]["head_mm"] < 2 * metrics["remeshed"]["original_head_mm"]
+    assert {p.name for p in (tmp_path / "o").glob("*.png")} == {
+        "rbf_warp.png", "heat.png", "sequence.png", "faces.png",
+    }  # fmt: skip
 
 
 @pytest.mark.slow

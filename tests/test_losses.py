@@ -154,3 +154,73 @@ def test_penalty_gradient_equals_finite_differences():
         return losses.critic(score, jax.random.key(1), REAL, FAKE, CONDITION)[0]
 
     check_grads(lambda w: loss(jnp.asarray(w)), (jnp.asarray(DIRECTION),), 1, modes=["rev"], eps=1e-2, rtol=2e-2)
+
+
+# Steps of expression networks.
+
+
+def steps_of(seed, *lead, frames=6, landmarks=4):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(*lead, frames, landmarks, 3)), jnp.float32)
+
+
+MASK = np.arange(6) < np.array([[6], [4], [2]])
+
+
+def naive_next_step(predicted, target, mask):
+    rows = [np.mean((predicted[k, t] - target[k, t]) ** 2) for k in range(len(mask)) for t in range(6) if mask[k, t]]
+    return np.mean(rows)
+
+
+def naive_path(predicted, target, mask):
+    rows = []
+    for k in range(len(mask)):
+        off = np.zeros((4, 3))
+        for t in range(6):
+            if mask[k, t]:
+                off = off + predicted[k, t] - target[k, t]
+                rows.append(np.mean([np.linalg.norm(v) for v in off]))
+    return np.mean(rows)
+
+
+@pytest.mark.parametrize(("loss", "naive"), [(losses.next_step, naive_next_step), (losses.path, naive_path)])
+def test_losses_of_steps_are_the_loops(loss, naive):
+    a, b = np.asarray(steps_of(1, 3), np.float64), np.asarray(steps_of(2, 3), np.float64)
+    np.testing.assert_allclose(loss(steps_of(1, 3), steps_of(2, 3), jnp.asarray(MASK)), naive(a, b, MASK), rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", [losses.next_step, losses.path])
+def test_what_is_masked_changes_nothing_and_the_truth_costs_nothing(loss):
+    a, b, mask = steps_of(1, 3), steps_of(2, 3), jnp.asarray(MASK)
+    changed = jnp.where(mask[..., None, None], a, 100.0)
+    assert float(loss(changed, b, mask)) == pytest.approx(float(loss(a, b, mask)), rel=1e-6)
+    assert float(loss(a, a, mask)) == 0
+    assert float(loss(a, b, jnp.zeros_like(mask))) == 0
+    slope = jax.grad(loss)(a, a, mask)
+    assert np.isfinite(slope).all() and not np.asarray(slope).any()
+    with pytest.raises(ValueError, match="mask must have shape"):
+        loss(a, b, mask[:, :5])
+
+
+def test_the_best_path_is_the_median_where_the_mean_is_nobodys():
+    """Two thirds go one way, one third the other: distance wants the way of the many, its square would not."""
+    targets = jnp.asarray(np.array([1.0, 1.0, -1.0])[:, None, None, None] * np.ones((3, 6, 1, 3)), jnp.float32)
+    mask = jnp.ones((3, 6), bool)
+    costs = [float(losses.path(jnp.full_like(targets, x), targets, mask)) for x in (1.0, 1 / 3, 0.0, -1.0)]
+    assert costs == sorted(costs)
+
+
+def test_strength_and_energy():
+    a, mask = steps_of(1, 3), jnp.asarray(MASK)
+    first = [np.mean(np.square(a[k, t])) for k in range(3) for t in range(6) if MASK[k, t]]
+    second = [
+        np.mean(np.square(a[k, t + 1] - a[k, t])) for k in range(3) for t in range(5) if MASK[k, t] and MASK[k, t + 1]
+    ]
+    wanted = losses.strength(a, mask)
+    np.testing.assert_allclose(wanted, [np.mean(first), np.mean(second)], rtol=1e-5)
+    assert float(losses.energy(a, mask, wanted)) == pytest.approx(0, abs=1e-10)
+    assert float(losses.energy(-a, mask, wanted)) == pytest.approx(0, abs=1e-10)  # whatever its direction
+    assert float(losses.energy(0.5 * a, mask, wanted)) == pytest.approx(0.5, rel=1e-5)  # (1/2 - 1)^2, twice
+    assert float(losses.energy(a, jnp.zeros_like(mask), wanted)) == 0
+    slope = jax.grad(losses.energy)(jnp.zeros_like(a), mask, wanted)
+    assert np.isfinite(slope).all()
+    check_grads(lambda x: losses.energy(x, mask, wanted), (0.7 * a,), order=1, atol=1e-2, rtol=1e-2)

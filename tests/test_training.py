@@ -298,3 +298,47 @@ def test_tensorboard_gets_every_entry_or_a_hint(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'facejax\[tensorboard\]'"):
         fit(tmp_path / "without", 8, tensorboard=True)
+
+
+# Several models in one step.
+
+DATASETS = np.random.default_rng(1).standard_normal((3, 20, 4)).astype(np.float32)
+
+
+def apart(which, total, folder):
+    """Train the models of `which` side by side; model i has data and constants of its own."""
+    stacked = {"w": jnp.stack([jnp.full((4, 2), 1.0 + i) for i in which])}
+    own = jnp.asarray([0.5 + i for i in which], jnp.float32)
+
+    def step_loss(params, key, batch, constants):
+        target, data = constants
+        return loss(params, key, data[batch], target)
+
+    def chosen(first, count):
+        rows = [training.epoch_indices(i, 20, 8)(first, count) + 20 * i for i in which]
+        return np.stack(rows, axis=1)
+
+    step = steps.side_by_side(steps.supervised(step_loss, OPTIMISER), [f"m{i}" for i in which], which)
+    state = steps.start_side_by_side(stacked, OPTIMISER, jax.random.key(3))
+    constants = (own, jnp.asarray(DATASETS.reshape(-1, 4)))
+    return training.run(step, state, chosen, folder, steps=total, constants=constants, chunk=4)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_models_side_by_side_come_out_as_alone(tmp_path, monkeypatch, backend):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)  # taking turns, or under vmap
+    together = apart([0, 1, 2], 10, tmp_path / "together")
+    assert int(together.step) == 10
+    for i in range(3):
+        alone = apart([i], 10, tmp_path / f"alone{i}")
+        np.testing.assert_allclose(alone.params["w"][0], together.params["w"][i], rtol=1e-5, atol=1e-6)
+    assert not np.allclose(together.params["w"][0], together.params["w"][1])
+    rows = entries(tmp_path / "together")
+    assert {"loss", "norm", "loss_m0", "loss_m1", "loss_m2", "step"} == set(rows[-1])
+    assert rows[-1]["loss"] == pytest.approx(np.mean([rows[-1][f"loss_m{i}"] for i in range(3)]), rel=1e-5)
+
+
+def test_models_side_by_side_resume_to_the_same_numbers(tmp_path):
+    whole = apart([0, 2], 12, tmp_path / "whole")
+    apart([0, 2], 8, tmp_path / "parts")
+    assert same(apart([0, 2], 12, tmp_path / "parts"), whole)

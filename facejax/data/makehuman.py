@@ -63,10 +63,14 @@ class Subject(NamedTuple):
 def template() -> Template:
     """The average young adult: equal ethnicities and genders, no sliders."""
     loaded = assets.load()
-    vertices = _compose(np.full(3, 1 / 3), 0.5, 25.0, 0.0, {})[: loaded.skin]
     packed = np.frombuffer(resources.files("facejax.assets").joinpath("face_mask.bin").read_bytes(), np.uint8)
     mask = np.unpackbits(packed)[: loaded.skin].astype(bool)
-    return Template(vertices, loaded.faces, loaded.landmarks, mask)
+    return Template(average().vertices, loaded.faces, loaded.landmarks, mask)
+
+
+def average() -> Subject:
+    """The template as a person, with eyes and teeth."""
+    return Subject("average", _compose(np.full(3, 1 / 3), 0.5, 25.0, 0.0, {}), np.full(3, 1 / 3), 0.5, 25.0)
 
 
 def subject(index: int, *, seed: int = 1) -> Subject:
@@ -149,7 +153,7 @@ def template_props() -> tuple[np.ndarray, ...]:
     lower.
     """
     loaded = assets.load()
-    whole = _compose(np.full(3, 1 / 3), 0.5, 25.0, 0.0, {})
+    whole = average().neutral
     eyes = [whole[np.unique(loaded.prop_faces[name])] for name in ("helper-l-eye", "helper-r-eye")]
     # A little smaller and further back than the prop, whose cornea bulges through the lids.
     centres = np.stack([(eye.min(axis=0) + eye.max(axis=0)) / 2 - [0, 0, 0.8] for eye in eyes])

@@ -6,6 +6,7 @@ figures can be given in millimetres. Halves are neutral -> peak (onset to the st
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -39,7 +40,7 @@ class Motions(NamedTuple):
 def halves(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
     """Every neutral -> peak and peak -> neutral motion of a split's subjects."""
     rows = []
-    for sequence, curve, scale in _sequences(data, split, direct=False):
+    for sequence, curve, scale in recordings(data, split, direct=False):
         label = data.labels.index(sequence.label)
         rise = curve[sequence.onset : sequence.apex_start + 1]
         fall = curve[sequence.apex_end : sequence.offset + 1]
@@ -51,7 +52,7 @@ def halves(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
 def directs(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
     """The directly performed peak -> peak transitions of a split; no capture set has them, evaluation only."""
     rows = []
-    for sequence, curve, scale in _sequences(data, split, direct=True):
+    for sequence, curve, scale in recordings(data, split, direct=True):
         start, end = (data.labels.index(name) for name in sequence.label.split(">"))
         rows.append((_resample(curve, frames), start, end, sequence.subject, scale))
     return _stack(rows)
@@ -78,7 +79,8 @@ def join(*parts: Motions) -> Motions:
     return Motions(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-def _sequences(data: store.Store, split: str, *, direct: bool):
+def recordings(data: store.Store, split: str, *, direct: bool) -> Iterator[tuple[store.Sequence, np.ndarray, float]]:
+    """Each sequence of a split, its displacements from neutral (T, L, 3), unitless, and the millimetres per unit."""
     members = set(data.subjects(split).tolist())
     rest = data.neutral[:, data.landmark_index]
     for sequence in data.sequences:

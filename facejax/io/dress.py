@@ -11,6 +11,7 @@ import numpy as np
 
 from facejax.geometry import align
 from facejax.io import props, scene
+from facejax.mesh import graph
 
 EYES = (range(42, 48), range(36, 42))  # landmarks of the left and right eye
 MOUTH = (*range(31, 36), *range(48, 68))
@@ -62,6 +63,18 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
         used, shown = front(teeth, faces)
         found.append(scene.Part(placed[..., used, :], shown, props.TEETH, 0.6))
     return tuple(found)
+
+
+def has_eye_holes(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray) -> bool:
+    """Whether a mesh is open where the eyes of its landmarks (68, 3) are, so that eyeballs belong behind it."""
+    middles = [vertices[loop].mean(axis=0) for loop in graph.boundary_loops(faces)]
+    for lids in EYES:
+        eye = landmarks[list(lids)]
+        centre = eye.mean(axis=0)
+        width = np.linalg.norm(eye - centre, axis=1).max()
+        if not any(np.linalg.norm(middle - centre) < width for middle in middles):
+            return False
+    return True
 
 
 def front(teeth: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

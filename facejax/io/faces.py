@@ -56,19 +56,44 @@ def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> 
     bad = ~np.isfinite(vertices).all(axis=1)
     if bad.any():
         raise meshes.MeshError(f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}")
-    turn = _axes(vertices[topology.landmark_index], topology.vertices[topology.landmark_index], name)
-    if not np.array_equal(turn, np.eye(3)):
-        vertices = vertices @ turn.T
-        notes.append(f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})")
-    size = _spread(vertices[topology.landmark_index]) / _spread(topology.vertices[topology.landmark_index])
+    marks = topology.landmark_index
+    turn = _axes(vertices[marks], topology.vertices[marks], name)
+    notes += axes_note(turn)
+    millimetres, unit = unit_of(_spread(vertices[marks]) / _spread(topology.vertices[marks]), name)
+    notes += [f"read as {unit}"] if unit != "millimetres" else []
+    return Face((vertices @ turn.T * millimetres).astype(np.float32), tuple(notes))
+
+
+def unit_of(size: float, name: str) -> tuple[float, str]:
+    """Millimetres of the unit in which a face of `size`, against the template's in millimetres, is a head's; its name.
+
+    Raises `meshes.MeshError` where it is none.
+    """
     for unit, millimetres in UNITS.items():
         if SIZE_RANGE[0] <= size * millimetres <= SIZE_RANGE[1]:
-            if unit != "millimetres":
-                notes.append(f"read as {unit}")
-            return Face((vertices * millimetres).astype(np.float32), tuple(notes))
+            return millimetres, unit
     raise meshes.MeshError(
         f"{name}: the face is {size:.3g} times as large as a head in millimetres; expected one in {', '.join(UNITS)}"
     )
+
+
+def turns() -> list[np.ndarray]:
+    """The 24 rotations (3, 3) that permute the axes."""
+    found = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0:
+                found.append(turn)
+    return found
+
+
+def axes_note(turn: np.ndarray) -> list[str]:
+    """What to say of a turn, one of `turns`: nothing where all stays as it is."""
+    if np.array_equal(turn, np.eye(3)):
+        return []
+    return [f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"]
 
 
 def _spread(points: np.ndarray) -> float:
@@ -80,21 +105,14 @@ def _axes(points: np.ndarray, target: np.ndarray, name: str) -> np.ndarray:
     if _spread(points) == 0:
         raise meshes.MeshError(f"{name}: all landmarks coincide: this is no face")
     shape, wanted = ((p - p.mean(axis=0)) / _spread(p) for p in (points, target))
-    turns = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            turn = np.zeros((3, 3))
-            turn[range(3), order] = signs
-            if np.linalg.det(turn) > 0:
-                turns.append(turn)
-    turns.sort(key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
-    best = np.linalg.norm(shape @ turns[0].T - wanted)
+    nearest = min(turns(), key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
+    best = np.linalg.norm(shape @ nearest.T - wanted)
     if best > 0.6:
         raise meshes.MeshError(
             f"{name}: its landmarks do not form a face (distance {best:.2f} of at most 0.6): the right number of "
             "vertices, but in another order?"
         )
-    return turns[0]
+    return nearest
 
 
 def _axis_name(row: np.ndarray) -> str:

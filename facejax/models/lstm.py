@@ -1,0 +1,204 @@
+"""A stack of LSTM layers with a dense output, as pure functions whose weight gradients are one product per matrix.
+
+    i, f, g, o = split(x @ input + h @ hidden + bias)
+    c' = sigmoid(f) c + sigmoid(i) tanh(g),    h' = sigmoid(o) tanh(c')
+
+Vocabulary: T steps, B sequences side by side, D numbers in and out, H units a layer. Arrays run time first, (T, B,
+...): a scan reads them as they lie. Weights are {"layers": [{"input" (D or H, 4H), "hidden" (H, 4H), "bias" (4H,)}],
+"dense": {"kernel" (H, D), "bias" (D,)}}; every sequence starts from a state of zeros.
+
+JAX differentiates a scan by adding one outer product a step to every weight's gradient: 59 ms instead of 17 for three
+layers of 128, 135 steps and 5 sequences on 2 cores. Both backward passes here keep the derivative of each step's
+gates instead and multiply once at the end.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Weights = dict[str, Any]
+
+
+def init(key: jax.Array, size: int, *, hidden: int = 128, layers: int = 3) -> Weights:
+    """Weights for `size` numbers in and out: Glorot inputs, orthogonal recurrences, a forget gate that starts open.
+
+    The dense layer starts at a tenth of its usual size: the first predictions are nearly "nothing moves".
+    """
+    if min(size, hidden, layers) < 1:
+        raise ValueError(f"size, hidden and layers must be 1 or more, got {size}, {hidden} and {layers}")
+    dense_key, *keys = jax.random.split(key, layers + 1)
+    glorot, orthogonal = jax.nn.initializers.glorot_uniform(), jax.nn.initializers.orthogonal()
+    rows = []
+    for i, layer_key in enumerate(keys):
+        input_key, *gate_keys = jax.random.split(layer_key, 5)
+        rows.append(
+            {
+                "input": glorot(input_key, (size if i == 0 else hidden, 4 * hidden)),
+                "hidden": jnp.concatenate([orthogonal(k, (hidden, hidden)) for k in gate_keys], axis=1),
+                "bias": jnp.zeros(4 * hidden).at[hidden : 2 * hidden].set(1.0),
+            }
+        )
+    return {"layers": rows, "dense": {"kernel": 0.1 * glorot(dense_key, (hidden, size)), "bias": jnp.zeros(size)}}
+
+
+@jax.jit
+def forward(weights: Weights, x: jax.Array) -> jax.Array:
+    """Outputs (T, B, D) for given inputs (T, B, D); layer by layer, with the input product out of the scan."""
+    for row in weights["layers"]:
+        x = _layer(row, x)
+    return _dense(weights["dense"], x)
+
+
+@jax.jit
+def follow(
+    weights: Weights, x: jax.Array, given: jax.Array, base: jax.Array | None = None, carry: float | jax.Array = 0.0
+) -> jax.Array:
+    """Outputs (T, B, D) where an input is x (T, B, D) if `given` (T, B), else the output of the step before.
+
+    To an output is added `base` (T, B, D) where its input was given, else `carry` times the output of the step before.
+    Gradients run through the outputs that were fed back, and not into `carry`. The first input of a sequence that is
+    not given is zero.
+    """
+    base = jnp.zeros_like(x) if base is None else base
+    return _follow(weights, x, given, base, jnp.asarray(carry, x.dtype))
+
+
+def step(weights: Weights, states: list[tuple[jax.Array, jax.Array]], x: jax.Array):
+    """One step of all layers: states [(h, c)] of (B, H) and an input (B, D) -> new states, and the output (B, D)."""
+    found = []
+    for row, (hidden, cell) in zip(weights["layers"], states, strict=True):
+        x, cell, _ = _cell(x @ row["input"] + row["bias"] + hidden @ row["hidden"], cell)
+        found.append((x, cell))
+    return found, _dense(weights["dense"], x)
+
+
+def start(weights: Weights, count: int) -> list[tuple[jax.Array, jax.Array]]:
+    """The states of `count` sequences before their first step."""
+    rest = [jnp.zeros((count, row["hidden"].shape[0]), row["hidden"].dtype) for row in weights["layers"]]
+    return [(zero, zero) for zero in rest]
+
+
+def _cell(gates: jax.Array, cell: jax.Array) -> tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]:
+    """Gates before their nonlinearity (B, 4H) and cells (B, H) -> hidden, cells, and what the backward pass needs."""
+    i, f, g, o = jnp.split(gates, 4, axis=-1)
+    i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
+    cell = f * cell + i * g
+    bent = jnp.tanh(cell)
+    return o * bent, cell, (i, f, g, o, bent)
+
+
+def _dense(layer: Weights, x: jax.Array) -> jax.Array:
+    return x @ layer["kernel"] + layer["bias"]
+
+
+@jax.custom_vjp
+def _layer(row: Weights, x: jax.Array) -> jax.Array:
+    """Hidden states (T, B, H) of one layer from inputs (T, B, D)."""
+    return _layer_forward(row, x)[0]
+
+
+def _layer_forward(row: Weights, x: jax.Array):
+    def advance(carry, gates):
+        hidden, cell = carry
+        hidden, after, kept = _cell(gates + hidden @ row["hidden"], cell)
+        return (hidden, after), (hidden, cell, kept)
+
+    zero = jnp.zeros((x.shape[1], row["hidden"].shape[0]), x.dtype)
+    _, (hidden, before, kept) = jax.lax.scan(advance, (zero, zero), x @ row["input"] + row["bias"])
+    return hidden, (row, x, hidden, before, kept)
+
+
+def _layer_backward(saved, slope: jax.Array):
+    row, x, hidden, before, kept = saved
+    turned = row["hidden"].T
+
+    def retreat(carry, inputs):
+        d_hidden, d_cell = carry
+        slope, before, (i, f, g, o, bent) = inputs
+        d_hidden = d_hidden + slope
+        d_cell = d_cell + d_hidden * o * (1 - bent * bent)
+        d_gates = jnp.concatenate(
+            [
+                d_cell * g * i * (1 - i),
+                d_cell * before * f * (1 - f),
+                d_cell * i * (1 - g * g),
+                d_hidden * bent * o * (1 - o),
+            ],
+            axis=-1,
+        )
+        return (d_gates @ turned, d_cell * f), d_gates
+
+    zero = jnp.zeros_like(hidden[0])
+    _, d_gates = jax.lax.scan(retreat, (zero, zero), (slope, before, kept), reverse=True)
+    return _weight_slopes(x, hidden, d_gates), d_gates @ row["input"].T
+
+
+_layer.defvjp(_layer_forward, _layer_backward)
+
+
+def _weight_slopes(x: jax.Array, hidden: jax.Array, d_gates: jax.Array) -> Weights:
+    """A layer's gradient from its inputs, its hidden states and the gradient of its gates, (T, B, .) each."""
+    previous = jnp.concatenate([jnp.zeros_like(hidden[:1]), hidden[:-1]])
+    return {
+        "input": _product(x, d_gates),
+        "hidden": _product(previous, d_gates),
+        "bias": jnp.sum(d_gates, axis=(0, 1)),
+    }
+
+
+def _product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Sum over steps and sequences of outer products: (T, B, m) and (T, B, n) -> (m, n)."""
+    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+
+
+@jax.custom_vjp
+def _follow(weights: Weights, x: jax.Array, given: jax.Array, base: jax.Array, carry: jax.Array) -> jax.Array:
+    return _follow_forward(weights, x, given, base, carry)[0]
+
+
+def _follow_forward(weights: Weights, x: jax.Array, given: jax.Array, base: jax.Array, carry: jax.Array):
+    count, width = x.shape[:2], weights["layers"][0]["hidden"].shape[1]
+    # Nothing is added to the gates; but the derivative with respect to what is added is that of the gates.
+    nothing = [jnp.zeros((*count, width), x.dtype) for _ in weights["layers"]] + [jnp.zeros_like(x)]
+    outputs, pull, (fed, hidden) = jax.vjp(
+        lambda added: _unroll(weights, x, given, base, carry, added), nothing, has_aux=True
+    )
+    return outputs, (weights, given, fed, hidden, pull)
+
+
+def _follow_backward(saved, slope: jax.Array):
+    weights, given, fed, hidden, pull = saved
+    (slopes,) = pull(slope)
+    *d_gates, d_outputs = slopes
+    inputs = [fed, *hidden[:-1]]
+    rows = [_weight_slopes(*arrays) for arrays in zip(inputs, hidden, d_gates, strict=True)]
+    dense = {"kernel": _product(hidden[-1], d_outputs), "bias": jnp.sum(d_outputs, axis=(0, 1))}
+    d_x = jnp.where(given[..., None], d_gates[0] @ weights["layers"][0]["input"].T, 0)
+    d_base = jnp.where(given[..., None], d_outputs, 0)
+    return {"layers": rows, "dense": dense}, d_x, None, d_base, None
+
+
+_follow.defvjp(_follow_forward, _follow_backward)
+
+
+def _unroll(weights: Weights, x, given, base, carry: jax.Array, added: list[jax.Array]):
+    """Outputs, and (the inputs that were used, the hidden states of each layer)."""
+
+    def advance(before, inputs):
+        states, last = before
+        x, given, base, (*added, added_last) = inputs
+        fed = signal = jnp.where(given[:, None], x, last)
+        carried = jnp.where(given[:, None], base, carry * last)
+        found = []
+        for row, (hidden, cell), more in zip(weights["layers"], states, added, strict=True):
+            signal, cell, _ = _cell(signal @ row["input"] + row["bias"] + hidden @ row["hidden"] + more, cell)
+            found.append((signal, cell))
+        last = carried + _dense(weights["dense"], signal) + added_last
+        return (found, last), (last, fed, [hidden for hidden, _ in found])
+
+    begin = (start(weights, x.shape[1]), jnp.zeros_like(x[0]))
+    _, (outputs, fed, hidden) = jax.lax.scan(advance, begin, (x, given, base, added))
+    return outputs, (fed, hidden)
