@@ -82,7 +82,7 @@ class Animate:
     """With --expression: go on to the last frame, though the expression is over."""
     seed: int = 7
     """With --end: another seed, another motion."""
-    weights: Path | None = None
+    model: Path | None = None
     """Weights to use in place of the released ones."""
     kernel: str | None = None
     """Radial basis function: gaussian, multiquadric, thin_plate, triharmonic or wendland_c2."""
@@ -215,11 +215,11 @@ def _animate(command: Animate) -> None:
         motion = drive.by_recording(recording, name=name)
     elif command.expression is not None:
         motion = drive.by_expression(
-            command.expression, frames=command.frames, whole=command.whole, weights=command.weights
+            command.expression, frames=command.frames, whole=command.whole, weights=command.model
         )
     else:
         labels = (command.start, command.end, *command.then)
-        motion = drive.by_labels(labels, seed=command.seed, frames=command.frames or 30, weights=command.weights)
+        motion = drive.by_labels(labels, seed=command.seed, frames=command.frames or 30, weights=command.model)
     options = {"pin": command.pin, "sigma": command.sigma, "smoothing": command.smoothing, **shown}
     options |= {} if command.kernel is None else {"kernel": command.kernel}
     source = {"mesh": command.mesh, "landmarks": command.landmarks, "person": person}

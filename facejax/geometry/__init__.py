@@ -1,5 +1,5 @@
-"""Pure mathematics on arrays: the sphere of motions, the SRVF transform, alignment."""
+"""Pure mathematics on arrays: the sphere of motions, the SRVF transform, alignment, radial basis functions."""
 
-from facejax.geometry import align, sphere, srvf
+from facejax.geometry import align, rbf, sphere, srvf
 
-__all__ = ["align", "sphere", "srvf"]
+__all__ = ["align", "rbf", "sphere", "srvf"]
