@@ -1,6 +1,6 @@
 """Landmark motion put on any mesh: its landmarks say where its face is, radial basis functions carry the rest.
 
-    face = animation.prepare(vertices, triangles, landmarks, template)
+    face = animation.prepare(vertices, triangles, landmarks)
     moved = animation.move(face, curve)  # (T, N, 3) of (T, 68, 3)
 
 The mesh may have any topology, unit and pose. Its landmarks may follow another scheme (`facejax.schemes`) than the
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax import schemes
+from facejax import pipeline, schemes
 from facejax.geometry import align, rbf
 from facejax.io import faces
 from facejax.io.meshes import MeshError
@@ -45,7 +45,7 @@ def prepare(
     vertices: np.ndarray,
     triangles: np.ndarray,
     landmarks: np.ndarray,
-    template: np.ndarray,
+    template: np.ndarray | None = None,
     *,
     pin: bool = True,
     name: str = "the mesh",
@@ -53,11 +53,15 @@ def prepare(
 ) -> Face:
     """Find the face of a mesh (N, 3), (F, 3) by its landmarks (L, 3), against those of the template (68, 3) in mm.
 
+    The template is the face in whose frame motions are given: by default that of the released models.
     With `pin` the rims that no landmark is near to, a neck's say, stay where they are. `options` go to `rbf.fit`
     (kernel, sigma, smoothing). Raises `MeshError`, naming `name`, for landmarks of an unknown scheme, far off the mesh,
     or not those of a face, and for what `rbf.fit` refuses.
     """
     vertices, landmarks = np.asarray(vertices, np.float64), np.asarray(landmarks, np.float64)
+    if template is None:
+        head = pipeline.load().face
+        template = head.vertices[head.landmark_index]
     try:
         shared = schemes.common(len(template), len(landmarks))
         points, wanted = landmarks[shared[1]], np.asarray(template, np.float64)[shared[0]]
@@ -92,9 +96,21 @@ def prepare(
     )
 
 
-def move(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0) -> jax.Array:
-    """Vertices (..., T, N, 3) in mm of a face that moves through displacements from neutral (..., T, 68, 3)."""
-    return _move(face.vertices, face.weights, landmarks_of(face, curve, intensity=intensity) - _at_rest(face))
+def move(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0, head: bool = False) -> jax.Array:
+    """Vertices (..., T, N, 3) in mm of a face that moves through displacements from neutral (..., T, 68, 3).
+
+    With `head` the motion turns the head, too: its rigid part, that of the landmarks which stay put in a head
+    (`schemes.Scheme.stable`), moves all vertices as one; without, pinned rims would hold it back.
+    """
+    rest, marks = _at_rest(face), landmarks_of(face, curve, intensity=intensity)
+    if not head:
+        return _move(face.vertices, face.weights, marks - rest)
+    own = np.isin(face.shared[1], schemes.by_count(len(face.landmarks)).stable)
+    pose = align.procrustes(jnp.broadcast_to(rest, marks.shape)[..., own, :], marks[..., own, :])
+    # Back into the head's own frame, where the neck stays; then all go with the head.
+    undone = jnp.einsum("...ji,...lj->...li", pose.rotation, marks - pose.translation[..., None, :])
+    moved = _move(face.vertices, face.weights, undone - rest)
+    return align.apply(pose, moved)
 
 
 def landmarks_of(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0) -> jax.Array:

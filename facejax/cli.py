@@ -92,6 +92,8 @@ class Animate:
     """Above 0, noisy landmarks need not be met exactly."""
     pin: bool = True
     """Hold rims still that are far from every landmark, such as the neck's."""
+    head: bool = False
+    """The motion turns the head, too (networks trained on heads that move): let all of the mesh go with it."""
     intensity: float = 1.0
     """Scale of the motion, 0 to 2."""
     fps: float | None = None
@@ -203,7 +205,7 @@ def _animate(command: Animate) -> None:
         )
     if command.mesh is None and command.landmarks is not None:
         raise ValueError(f"--landmarks {command.landmarks}: of which mesh? name it with --mesh")
-    person = makehuman.average() if command.person is None else makehuman.subject(command.person)
+    person = None if command.person is None else makehuman.subject(command.person)
     shown = {"fps": command.fps, "formats": command.formats}
     if command.livelink is not None:
         recording = drive.read_recording(
@@ -211,7 +213,11 @@ def _animate(command: Animate) -> None:
         )
         name = command.livelink.stem
         if command.mesh is None:
-            return _said(produce.play(recording, person, name, command.out, intensity=command.intensity, **shown))
+            return _said(
+                produce.play(
+                    recording, person or makehuman.average(), name, command.out, intensity=command.intensity, **shown
+                )
+            )
         motion = drive.by_recording(recording, name=name)
     elif command.expression is not None:
         motion = drive.by_expression(
@@ -220,7 +226,13 @@ def _animate(command: Animate) -> None:
     else:
         labels = (command.start, command.end, *command.then)
         motion = drive.by_labels(labels, seed=command.seed, frames=command.frames or 30, weights=command.model)
-    options = {"pin": command.pin, "sigma": command.sigma, "smoothing": command.smoothing, **shown}
+    options = {
+        "head": command.head,
+        "pin": command.pin,
+        "sigma": command.sigma,
+        "smoothing": command.smoothing,
+        **shown,
+    }
     options |= {} if command.kernel is None else {"kernel": command.kernel}
     source = {"mesh": command.mesh, "landmarks": command.landmarks, "person": person}
     _said(produce.animate(motion, command.out, **source, intensity=command.intensity, **options))

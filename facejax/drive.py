@@ -43,7 +43,9 @@ def by_expression(
     """
     networks = expressions.load(weights)
     stop = 0.0 if whole else expressions.STOP
-    neutral = makehuman.template().vertices[makehuman.template().landmarks] if neutral is None else neutral
+    if neutral is None:
+        head = pipeline.load().face
+        neutral = head.vertices[head.landmark_index]
     curve = expressions.displacements(networks, label, neutral, frames=frames, stop=stop)
     return Motion(np.asarray(curve), label, ((0, label),), networks.rate)
 

@@ -126,12 +126,14 @@ def animate(
     mesh: Path | None = None,
     landmarks: Path | None = None,
     person: makehuman.Subject | None = None,
+    head: bool = False,
     intensity: float = 1.0,
     fps: float | None = None,
     formats: Sequence[str] = ("glb", "html", "webp"),
     **options,
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Put a motion on a mesh with its landmarks, or on a MakeHuman person; the files, and what was assumed.
+    """Put a motion on a mesh with its landmarks, on a MakeHuman person or on the average face; the files, and what was
+    assumed.
 
     `options` go to `animation.prepare` (pin, kernel, sigma, smoothing).
     """
@@ -139,19 +141,20 @@ def animate(
     results.check_formats(formats)
     rate = motion.fps if fps is None else fps
     results.check_rate(rate)
-    shape = makehuman.template()
-    template = shape.vertices[shape.landmarks]
-    name = person.name if mesh is None else str(mesh)
-    vertices, triangles, marks = _mesh(mesh, landmarks, person)
-    face = animation.prepare(vertices, triangles, marks, template, name=name, **options)
-    moved = np.asarray(animation.move(face, motion.curve, intensity=intensity))
+    models = pipeline.load()
+    name = person.name if person else "average"
+    if mesh is not None:
+        name = mesh.stem
+    vertices, triangles, marks = _mesh(models.face, mesh, landmarks, person)
+    template = models.face.vertices[models.face.landmark_index]
+    face = animation.prepare(vertices, triangles, marks, template, name=str(mesh or name), **options)
+    moved = np.asarray(animation.move(face, motion.curve, intensity=intensity, head=head))
     marks = np.asarray(animation.landmarks_of(face, motion.curve, intensity=intensity))
     extras = ()
     if len(face.landmarks) == dress.IBUG and dress.has_eye_holes(face.vertices, face.faces, face.landmarks):
-        extras = dress.parts(dress.Props(template, *makehuman.template_props()), face.landmarks, marks)
+        extras = dress.parts(models.props, face.landmarks, marks)
     shot = io.scene.make(moved, face.faces, captions=motion.captions, landmarks=marks, extras=extras)
-    stem = f"{person.name if mesh is None else mesh.stem}-{results.stem([motion.name])}"
-    return _write(out, stem, shot, rate, formats), motion.notes + face.notes
+    return _write(out, f"{name}-{results.stem([motion.name])}", shot, rate, formats), motion.notes + face.notes
 
 
 def play(
@@ -177,21 +180,21 @@ def play(
     return _write(out, f"{person.name}-{name}", shot, rate, formats), recording.notes
 
 
-def _mesh(mesh: Path | None, landmarks: Path | None, person: makehuman.Subject | None):
-    """Vertices, triangles and landmarks (L, 3) to be moved."""
-    shape = makehuman.template()
+def _mesh(head: pipeline.Face, mesh: Path | None, landmarks: Path | None, person: makehuman.Subject | None):
+    """Vertices, triangles and landmarks (L, 3) to be moved; `head` is the topology that needs no landmark file."""
     if mesh is None:
-        return person.vertices, shape.faces, person.vertices[shape.landmarks]
+        vertices = head.vertices if person is None else person.vertices
+        return vertices, head.faces, vertices[head.landmark_index]
     found = io.load_mesh(mesh)
     if found.faces is None:
         raise ValueError(f"{mesh}: has no triangles, nothing to move")
     if landmarks is not None:
         return found.vertices, found.faces, io.landmarks.read(landmarks, found.vertices, found.faces).points
-    if len(found.vertices) != len(shape.vertices):
+    if len(found.vertices) != len(head.vertices):
         raise ValueError(
-            f"{mesh}: --landmarks is missing; only MakeHuman's head, {len(shape.vertices)} vertices, goes without"
+            f"{mesh}: --landmarks is missing; only MakeHuman's head, {len(head.vertices)} vertices, goes without"
         )
-    return found.vertices, found.faces, found.vertices[shape.landmarks]
+    return found.vertices, found.faces, found.vertices[head.landmark_index]
 
 
 def _write(out: Path, stem: str, shot: io.scene.Scene, rate: float, formats: Sequence[str]) -> list[Path]:

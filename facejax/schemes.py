@@ -105,6 +105,15 @@ _BU = (
 _WORDS = {"jaw": ("jaw", "chin", "contour"), "brows": ("brow",), "nose": ("nose",), "eyes": ("eye",), "lips": ("lip",)}
 
 
+# What hardly moves in the head's own frame: bridge of the nose, corners of the eyes, the contour beside the ears.
+_STABLE = (
+    *(f"nose bridge {i}" for i in (1, 2, 3)),
+    *(f"{side} eye {corner} corner" for side in ("right", "left") for corner in ("inner", "outer")),
+    *(f"{side} jaw {i}" for side in ("right", "left") for i in (7, 8)),
+    *(f"{side} contour 7" for side in ("right", "left")),
+)
+
+
 class Scheme(NamedTuple):
     """L landmarks in order."""
 
@@ -112,6 +121,7 @@ class Scheme(NamedTuple):
     points: tuple[str, ...]  # (L,) anatomical names, no two alike
     groups: dict[str, np.ndarray]  # each of `GROUPS` -> (n,) int32; empty where a scheme has none
     mirror: np.ndarray  # (L,) int32: where the point of the other side stands; one of the middle gives itself
+    stable: np.ndarray  # (n,) int32: points that stay put in the head's own frame
 
 
 def by_count(count: int) -> Scheme:
@@ -147,7 +157,8 @@ def _build(count: int) -> Scheme:
     name, points = _SCHEMES[count]
     words = [set(point.split()) for point in points]
     groups = {group: _index(i for i, w in enumerate(words) if w & set(_WORDS[group])) for group in GROUPS}
-    return Scheme(name, points, groups, _index(points.index(other_side(point)) for point in points))
+    mirror = _index(points.index(other_side(point)) for point in points)
+    return Scheme(name, points, groups, mirror, _index(i for i, point in enumerate(points) if point in _STABLE))
 
 
 def _index(values) -> np.ndarray:

@@ -134,3 +134,17 @@ def test_landmarks_that_are_no_face(head, curve):
         animation.move(face, curve[:, :51])
     with pytest.raises(ValueError, match="intensity"):
         animation.move(face, curve, intensity=3)
+
+
+def test_a_head_that_turns_takes_its_neck_along(head, curve):
+    """The same expression on a nodding head: the expression, nodding."""
+    vertices, faces, marks, template = head
+    face = animation.prepare(template=template, vertices=vertices, triangles=faces, landmarks=marks)
+    still = np.asarray(animation.landmarks_of(face, curve))
+    angles = np.linspace(0, 0.2, 5)
+    nods = np.stack([[[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]] for a in angles])
+    nodding = np.einsum("tij,tlj->tli", nods, still) + 3 * angles[:, None, None]
+    unitless = (nodding - marks) @ face.rotation / face.size
+    moved = np.asarray(animation.move(face, unitless, head=True))
+    wanted = np.einsum("tij,tlj->tli", nods, np.asarray(animation.move(face, curve))) + 3 * angles[:, None, None]
+    np.testing.assert_allclose(moved, wanted, atol=2e-2)

@@ -152,3 +152,11 @@ def test_unknown_counts_name_the_known():
 def test_tables_are_nobodys_to_change():
     with pytest.raises(ValueError, match="read-only"):
         schemes.by_count(68).mirror[0] = 3
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_what_stays_put_lies_on_both_sides_of_the_upper_face(count):
+    scheme = schemes.by_count(count)
+    names = [scheme.points[i] for i in scheme.stable]
+    assert len(names) >= 6 and not any("lip" in name or "brow" in name or name == "chin" for name in names)
+    assert {schemes.other_side(name) for name in names} == set(names)

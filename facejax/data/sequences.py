@@ -17,8 +17,6 @@ from facejax.data import motions, store
 from facejax.geometry import align
 
 TAIL = 5  # frames of standing still after the end that a network learns from, so that it learns to stop
-# Landmarks of iBUG's 68 that hardly move in the head's own frame: ears' side of the jaw, nose bridge, eye corners.
-STABLE68 = (0, 1, 15, 16, 27, 28, 29, 36, 39, 42, 45)
 
 
 class Sequences(NamedTuple):
@@ -94,12 +92,10 @@ def without_head_motion(sequences: Sequences, stable: Sequence[int] | None = Non
     """The same with every frame's rigid motion taken out: Procrustes of the `stable` landmarks onto those at rest.
 
     Seo and Luo 2021, 4.2, tried this and kept the head's motion. `stable` names landmarks that stay put in the head's
-    own frame; by default those of iBUG's 68, and all landmarks of another scheme.
+    own frame; by default those of the scheme (`facejax.schemes`). Raises `ValueError` for a number of landmarks that is
+    no scheme's.
     """
-    count = sequences.neutral.shape[1]
-    which = np.arange(count) if stable is None else np.asarray(stable)
-    if stable is None and count == 68:
-        which = np.array(STABLE68)
+    which = schemes.by_count(sequences.neutral.shape[1]).stable if stable is None else np.asarray(stable)
     rest = sequences.neutral[:, None]
     placed = sequences.curves + rest
     pose = align.procrustes(placed[:, :, which], np.broadcast_to(rest, placed.shape)[:, :, which])
