@@ -5,20 +5,22 @@
 Seo & Luo 2021: three layers of 128 and a dense layer, 135 frames, batches of 5, Adam at 1e-3, masked mean squared
 error; D = 204 numbers a frame (68 landmarks) and the paper's 249. Tasks:
 
-* `forward`, `gradient`, `training step` of one network, from the same weights and data on both sides. `minutes` is
-  what 10,000 such steps take: the paper says 30 minutes on an i5. --whole really runs them, ours in scanned chunks of
-  100 as `facejax.training.run` does, PyTorch's in a loop, a chunk each in turns.
+* `forward`, `gradient`, `training step` of one network, from the same weights and data on both sides; `scanned` is
+  the step within one call of ten, as the training loop has it. `minutes` is what 10,000 such steps take: the paper
+  says 30 minutes on an i5. --whole really runs them, ours in scanned chunks of 100 as `facejax.training.run` does,
+  PyTorch's in a loop, a chunk each in turns.
 * `step of 6`: six networks by `facejax.steps.side_by_side`, one after another, under `vmap`, and by PyTorch.
 * `follow`: forward and gradient of the network that reads its own output, beside the automatic gradient of its scan.
 
 Outputs, gradients and the losses of the first steps are checked to be equal before anything is timed. `gflops` counts
-the matrix products alone, as the architecture states them; `of_peak` is their share of the fastest product of two
-square matrices in the same run, by either library.
+the matrix products alone, as the architecture states them, at the fastest repeat; `of_peak` is its share of what the
+fastest product of two square matrices reaches in the same run, by either library.
 
 The peer is eager: torch.compile 2.13 does not look into `nn.LSTM` (a graph break leaves it as it is, and only the loss
 would be compiled), and with its experimental `allow_rnn` the compiled program fails. On a machine that is busy with
-other work PyTorch suffers more, from OpenMP threads that wait for one another: measure on a quiet one. PyTorch comes
-with the extra `bench`; without it its rows are left out. About three minutes, --whole about ten more.
+other work PyTorch suffers by far more, from OpenMP threads that wait for one another: measure on a quiet one, or give
+both a core, `taskset -c 1 python -m benchmarks.lstm --threads 1`. PyTorch comes with the extra `bench`; without it its
+rows are left out. About three minutes, --whole about ten more.
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ except ImportError:
     torch = None
 
 RATE, CHUNK, WHOLE = 1e-3, 100, 10_000
+SCAN = 10  # steps in one call where they are scanned
 REST = 0.02  # seconds between calls: OpenMP's threads spin on for a while when their work is done
 
 
@@ -69,6 +72,8 @@ class Config:
     """Expressions."""
     steps: int = WHOLE
     """Of --whole, whole hundreds."""
+    threads: int = os.cpu_count() or 1
+    """Of PyTorch; JAX takes the cores that the process may use."""
     square: int = 1024
     """Side of the matrices whose product is the peak."""
 
@@ -93,7 +98,7 @@ def run(config: Config) -> list[dict]:
     if torch is None:
         print('PyTorch is not here and its rows are left out: pip install ".[bench]" brings it.')
     else:
-        torch.set_num_threads(os.cpu_count())
+        torch.set_num_threads(config.threads)
     landmarks, batches = (x[:1] if config.quick else x for x in (config.landmarks, config.batches))
     rows = _square(config)
     measure = Measure(5 if config.quick else 25, max(row["gflops"] for row in rows))
@@ -104,7 +109,7 @@ def run(config: Config) -> list[dict]:
         rows += _six(config, 3 * landmarks[0], batch, measure)
         rows += _follow(config, 3 * landmarks[0], batch, measure)
     if config.whole:
-        rows += _whole(config, 3 * landmarks[0], batches[0], measure)
+        rows += _whole(config, 3 * landmarks[0], batches[0])
     return rows
 
 
@@ -112,14 +117,15 @@ def _square(config: Config) -> list[dict]:
     """The fastest product of this machine, by either library."""
     a = np.random.default_rng(0).normal(size=(config.square, config.square)).astype(np.float32)
     ours, product = jnp.asarray(a), jax.jit(jnp.matmul)
-    functions, about = {"facejax": lambda: product(ours, ours)}, {"facejax": f"jax {jax.__version__}"}
+    functions, about = {"facejax": lambda: product(ours, ours)}, {"facejax": f"jax {jax.__version__}, {_cores()} cores"}
     if torch is not None:
         theirs = torch.tensor(a)
-        functions["torch"], about["torch"] = lambda: theirs @ theirs, f"torch {torch.__version__}"
+        functions["torch"] = lambda: theirs @ theirs
+        about["torch"] = f"torch {torch.__version__}, {config.threads} threads"
     rows = _rows(f"product of {config.square}", functions, 2e-9 * config.square**3, Measure(15, np.nan))
     for row in rows:
         load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-        row["about"] = f"{about[row['side']]}, {os.cpu_count()} threads{load}"
+        row["about"] = about[row["side"]] + load
         del row["of_peak"]
     return rows
 
@@ -128,29 +134,30 @@ def _one(config: Config, size: int, batch: int, measure: Measure) -> list[dict]:
     """One network: forward, gradient, training step."""
     data = _data(config, size, batch)
     weights = _weights(config, size, 0)
-    gradient = jax.jit(jax.grad(lambda weights: _loss(weights, None, data, ())[0]))
+    slope = jax.jit(jax.grad(lambda weights, data: _loss(weights, None, data, ())[0]))
     advance = _jitted(_step())
     tasks = {
         "forward": {"facejax": lambda: lstm.forward(weights, data.x)},
-        "gradient": {"facejax": lambda: gradient(weights)},
-        "training step": {"facejax": _steps(advance, _start(weights), data)},
+        "gradient": {"facejax": lambda: slope(weights, data)},
+        "training step": {
+            "facejax": _steps(advance, _start(weights), data),
+            "facejax, scanned": _steps(_jitted(_scanned(_step())), _start(weights), data),
+        },
     }
     if torch is not None:
         peer, held = Peer(weights), _to_torch(data)
         calls = {"forward": peer.forward, "gradient": peer.gradient, "training step": peer.step}
         for task, call in calls.items():
             tasks[task]["torch"] = lambda call=call: call(held)
-            tasks[task]["torch, 1 thread"] = lambda call=call: _alone(call, held)
+            if config.threads > 1:
+                tasks[task]["torch, 1 thread"] = lambda call=call: _alone(call, held)
         _check_equal(lstm.forward(weights, data.x), peer.forward(held))
-        _check_equal(gradient(weights), Peer.as_weights(peer.gradient(held)))
+        _check_equal(slope(weights, data), Peer.as_weights(peer.gradient(held)))
         _check_steps([_steps(advance, _start(weights), data), lambda: peer.step(held)])
-    forward = _products(config, size, batch)
-    # The gradient takes two more products for each, but the first layer's inputs want no slope.
-    both = 3 * forward - 2e-9 * config.frames * batch * size * 4 * config.hidden
-    rows = []
+    forward, both, rows = _products(config, size, batch), _step_products(config, size, batch), []
     for (task, functions), gflop in zip(tasks.items(), (forward, both, both), strict=True):
         rows += _rows(task, functions, gflop, measure, numbers=size, batch=batch)
-    for row in rows[-len(tasks["training step"]) :]:
+    for row in rows[-len(functions) :]:
         row["minutes"] = row["median_ms"] * WHOLE / 60e3
     return rows
 
@@ -189,8 +196,11 @@ def _six(config: Config, size: int, batch: int, measure: Measure) -> list[dict]:
 
         makers["torch"] = peers
     _check_steps([make() for make in makers.values()])
-    gflop = count * (3 * _products(config, size, batch) - 2e-9 * config.frames * batch * size * 4 * config.hidden)
     functions = {name: make() for name, make in makers.items()}
+    state = steps.start_side_by_side(together, optax.adam(RATE), jax.random.key(0))
+    scanned = _jitted(_scanned(steps.side_by_side(_step(), names, range(count))))
+    functions["facejax, scanned"] = _steps(scanned, state, stacked, ((), ()))
+    gflop = count * _step_products(config, size, batch)
     return _rows(f"step of {count}", functions, gflop, measure, numbers=size, batch=batch)
 
 
@@ -201,8 +211,8 @@ def _follow(config: Config, size: int, batch: int, measure: Measure) -> list[dic
     forms = {"facejax": lstm.follow, "facejax, automatic": jax.jit(_automatic)}
 
     def gradient(form: Callable) -> Callable:
-        slope = jax.jit(jax.grad(lambda weights: _error(form(weights, data.x, given), data)))
-        return lambda: slope(weights)
+        slope = jax.jit(jax.grad(lambda weights, data: _error(form(weights, data.x, given), data)))
+        return lambda: slope(weights, data)
 
     tasks = {
         "follow": {name: lambda form=form: form(weights, data.x, given) for name, form in forms.items()},
@@ -227,15 +237,17 @@ def _automatic(weights: lstm.Weights, x: jax.Array, given: jax.Array) -> jax.Arr
     return jax.lax.scan(advance, (lstm.start(weights, x.shape[1]), jnp.zeros_like(x[0])), (x, given))[1]
 
 
-def _whole(config: Config, size: int, batch: int, measure: Measure) -> list[dict]:
+def _whole(config: Config, size: int, batch: int) -> list[dict]:
     """All steps of a training, a chunk of ours and a chunk of PyTorch's in turns; batches drawn from 80 sequences."""
     data, weights = _data(config, size, 80), _weights(config, size, 0)
     step, state = _step(), _start(weights)
 
     @jax.jit(donate_argnums=0)
     def advance(state, chosen, data):
-        take = lambda which: jax.tree.map(lambda leaf: leaf[:, which], data)  # noqa: E731
-        return jax.lax.scan(lambda state, which: step(state, take(which), ()), state, chosen)
+        def one(state, which):
+            return step(state, jax.tree.map(lambda leaf: leaf[:, which], data), ())
+
+        return jax.lax.scan(one, state, chosen)
 
     def ours(chosen: np.ndarray) -> np.ndarray:
         nonlocal state
@@ -327,11 +339,16 @@ class Peer:
 
 def _alone(function: Callable, batch: Batch):
     """A call with one thread: for small products, or on a busy machine, that can be the faster way."""
+    before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         return function(batch)
     finally:
-        torch.set_num_threads(os.cpu_count())
+        torch.set_num_threads(before)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _names(layer: int) -> tuple[str, str, str]:
@@ -372,6 +389,15 @@ def _step() -> training.Step:
 
 def _start(weights: lstm.Weights) -> training.TrainState:
     return steps.start_supervised(weights, optax.adam(RATE), jax.random.key(0))
+
+
+def _scanned(step: training.Step) -> training.Step:
+    """SCAN steps on one batch."""
+
+    def several(state, batch: Batch, constants):
+        return jax.lax.scan(lambda state, _: step(state, batch, constants), state, length=SCAN)
+
+    return several
 
 
 def _jitted(step: training.Step) -> Callable:
@@ -417,6 +443,11 @@ def _products(config: Config, size: int, batch: int) -> float:
     return 2e-9 * config.frames * batch * each
 
 
+def _step_products(config: Config, size: int, batch: int) -> float:
+    """The same of a gradient: two more products for each, but the first layer's inputs want no slope."""
+    return 3 * _products(config, size, batch) - 2e-9 * config.frames * batch * size * 4 * config.hidden
+
+
 def _rows(task: str, functions: dict[str, Callable], gflop: float, measure: Measure, **about: int) -> list[dict]:
     """Times of functions in turns, the first of them being what the others are compared with."""
     jax.clear_caches()  # the first call compiles again what was compiled for the checks
@@ -424,6 +455,9 @@ def _rows(task: str, functions: dict[str, Callable], gflop: float, measure: Meas
     for name, function in functions.items():
         rested |= {name: function, f"{name}, rest": lambda: time.sleep(REST)}
     found = _measure.interleaved(rested, repeats=measure.repeats)
+    for name in functions:
+        if name.endswith("scanned"):
+            found[name] |= {key: found[name][key] / SCAN for key in ("min_s", "median_s")}
     median = found["facejax"]["median_s"]
     return [
         {
@@ -434,8 +468,8 @@ def _rows(task: str, functions: dict[str, Callable], gflop: float, measure: Meas
             "min_ms": 1e3 * found[name]["min_s"],
             "median_ms": 1e3 * found[name]["median_s"],
             "over_facejax": found[name]["median_s"] / median,
-            "gflops": gflop / found[name]["median_s"],
-            "of_peak": gflop / found[name]["median_s"] / measure.peak,
+            "gflops": gflop / found[name]["min_s"],
+            "of_peak": gflop / found[name]["min_s"] / measure.peak,
         }
         for name in functions
     ]

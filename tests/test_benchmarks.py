@@ -10,6 +10,8 @@ from benchmarks import _measure, lstm
 def test_lstm(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(lstm, "torch", None)
     monkeypatch.setattr(lstm, "CHUNK", 3)
+    monkeypatch.setattr(lstm, "SCAN", 2)
+    monkeypatch.setattr(lstm.jax, "clear_caches", lambda: None)  # compiling twice is what takes the time
     config = lstm.Config(
         quick=True, whole=True, landmarks=(2,), batches=(2,), frames=6, hidden=4, networks=2, steps=6, square=16
     )
@@ -20,7 +22,9 @@ def test_lstm(tmp_path, monkeypatch, capsys):
         ("forward", "facejax"),
         ("gradient", "facejax"),
         ("training step", "facejax"),
+        ("training step", "facejax, scanned"),
         ("step of 2", "facejax"),
+        ("step of 2", "facejax, scanned"),
         ("step of 2", "facejax, one by one"),
         ("step of 2", "facejax, vmap"),
         ("follow", "facejax"),
@@ -34,17 +38,14 @@ def test_lstm(tmp_path, monkeypatch, capsys):
     assert "[bench]" in printed and printed.count("\n| ") == 2 + len(rows)
 
 
-@pytest.mark.parametrize("off", [0.0, 1e-3])
-def test_lstm_refuses_a_wrong_answer(off):
-    if off:
-        with pytest.raises(AssertionError):
-            lstm._check_equal({"a": [1.0, 2.0]}, {"a": [1.0, 2.0 + off]})
-    else:
-        lstm._check_equal({"a": [1.0, 2.0]}, {"a": [1.0, 2.0]})
+def test_lstm_refuses_a_wrong_answer():
+    lstm._check_equal({"a": [1.0, 2.0]}, {"a": [1.0, 2.0]})
+    with pytest.raises(AssertionError):
+        lstm._check_equal({"a": [1.0, 2.0]}, {"a": [1.0, 2.001]})
 
 
 def test_lstm_counts_the_products():
-    """17,000 parameters in the products of a network of 6 in, 40 hidden; each is a multiplication and an addition."""
+    """A multiplication and an addition for every entry of every matrix."""
     config = lstm.Config(frames=3, hidden=40)
-    parameters = 4 * 40 * (6 + 40) + 2 * 4 * 40 * 80 + 40 * 6
-    assert lstm._products(config, 6, 2) == pytest.approx(2e-9 * parameters * 3 * 2)
+    entries = 4 * 40 * (6 + 40) + 2 * 4 * 40 * 80 + 40 * 6
+    assert lstm._products(config, 6, 2) == pytest.approx(2e-9 * entries * 3 * 2)

@@ -67,8 +67,8 @@ def test_expression_lstm(own_cache, tmp_path):
     variants = ("truth", "ours")
     config = expression_lstm.Config(out=tmp_path / "o", level=1, steps=2, variants=variants, **TINY)
     expression_lstm.run(config)
-    metrics = check(tmp_path / "o", "chosen", "validation", "test", "train_seconds")
-    assert set(metrics["validation"]) == set(variants) and metrics["chosen"] in variants
+    metrics = check(tmp_path / "o", "chosen", "choice", "test", "train_seconds")
+    assert set(metrics["choice"]) == set(variants) and metrics["chosen"] in variants
     assert all(row["whole_network"] > 0 for row in metrics["test"].values()) and len(metrics["test"]) == 6
     networks = expressions.load(tmp_path / "o" / "expressions.safetensors")
     assert networks.about["variant"] == metrics["chosen"]
