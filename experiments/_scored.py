@@ -122,4 +122,4 @@ def sheet(path: Path, networks: expressions.Expressions) -> None:
         moved = np.asarray(animation.move(face, chosen))
         rows.append(render.frames(moved, face.faces, size=PICTURE, camera=camera, extras=parts))
     with files.replacing(path) as temporary:
-        Image.fromarray(render.contactsheet(rows, row_labels=list(networks.labels))).save(temporary)
+        Image.fromarray(render.contact_sheet(rows, row_labels=list(networks.labels))).save(temporary)

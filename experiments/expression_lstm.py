@@ -175,7 +175,7 @@ def _dataset(config: Config, variant: Variant) -> store.Store:
 
 
 def scores(config: Config, variant: Variant, params: sequence.Params, splits: tuple[str, ...]) -> dict[str, dict]:
-    """`evaluation.expression_scores` of each emotion; people of all `splits` together, of the first where heads move."""
+    """`evaluation.expression_scores` of each emotion; all `splits` together, the first where heads move."""
     data = _dataset(config, variant)
     splits = splits if variant.head == "none" else splits[:1]
     train = recordings(config, variant, "train")

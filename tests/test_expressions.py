@@ -81,6 +81,7 @@ def test_the_released_networks_move_a_face_and_bring_it_home():
         assert away[0] == 0 and away[-1] < 0.35 * away.max()
         # The farthest from neutral somewhere in the middle, by as much as an expression moves a face.
         assert 8 < away.argmax() < len(curve) - 5 and 0.02 < away.max() < 0.4
-        # Longer than anything it learnt from: it stays where it is, no second expression and no drift away.
-        longer = np.asarray(expressions.displacements(networks, label, frames=3 * networks.frames, stop=0.0))
-        assert np.linalg.norm(longer, axis=(1, 2)).max() < 1.2 * away.max()
+        # Asked for more than anything that it learnt from, it still stops when the expression is over.
+        longer = np.asarray(expressions.displacements(networks, label, frames=3 * networks.frames))
+        assert longer.shape == curve.shape
+        np.testing.assert_allclose(longer, curve, atol=1e-4)
