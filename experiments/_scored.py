@@ -35,10 +35,10 @@ def variants_table(table: dict[str, dict], seconds: dict[str, float]) -> str:
     """Every way of training: errors over the strongest rival's, motion over real motion."""
     rows = []
     for name, found in table.items():
-        ratios = [ratios(row) for row in found.values()]
-        means = [float(np.mean([ratio[key] for ratio in ratios])) for key in ("next", "rest", "whole")]
-        spans = ["{:.2f} to {:.2f}".format(*_span([r[key] for r in ratios])) for key in ("energy", "acceleration")]
-        rows.append((name, *means, f"{max(ratio['whole'] for ratio in ratios):.3f}", *spans, f"{seconds[name]:.0f}"))
+        each = [ratios(row) for row in found.values()]
+        means = [float(np.mean([ratio[key] for ratio in each])) for key in ("next", "rest", "whole")]
+        spans = ["{:.2f} to {:.2f}".format(*_span([r[key] for r in each])) for key in ("energy", "acceleration")]
+        rows.append((name, *means, f"{max(ratio['whole'] for ratio in each):.3f}", *spans, f"{seconds[name]:.0f}"))
     header = (
         "validation subjects and 120 more, six emotions", "next frame", f"after {PREFIX} frames", "from neutral",
         "the worst emotion", "energy", "acceleration", "training, s",
