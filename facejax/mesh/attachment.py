@@ -27,7 +27,7 @@ REACH = 3.0  # in landmark spacings
 
 
 def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
-    """Raise `ValueError` where one of the landmarks (L, 3) does not lie on the mesh of vertices (N, 3).
+    """Raise `ValueError` where one of the landmarks (L, 3) does not lie on the mesh of vertices (N, 3), or on another.
 
     It may be as far from the nearest vertex as a tenth of the landmarks' spread or, on a coarse mesh, as that vertex is
     from its sixth neighbour.
@@ -37,6 +37,10 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
     distance, nearest = tree.query(landmarks)
     ring = tree.query(vertices[nearest], k=[min(7, len(vertices))])[0][:, 0]
     spread = np.sqrt(np.mean(np.sum((landmarks - landmarks.mean(axis=0)) ** 2, axis=1)))
+    pairs = cKDTree(landmarks).query_pairs(rbf.COINCIDENT * spread)
+    if pairs:
+        a, b = min(pairs)
+        raise ValueError(f"landmarks {a} and {b} are in one place, {landmarks[a]}: move one, or leave it out")
     limit = np.maximum(OFF_MESH * spread, ring)
     worst = int(np.argmax(distance - limit))
     if distance[worst] > limit[worst]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from facejax.data import makehuman
 from facejax.geometry import rbf
 from facejax.mesh import attachment, graph
 
@@ -168,3 +169,12 @@ def test_weights_refuse_landmarks_off_the_mesh(template, landmarks):
 def test_a_single_landmark_has_no_spacing(template):
     with pytest.raises(ValueError, match="at least 2, got 1"):
         attachment.rim(template.vertices, template.faces, np.zeros((1, 3)))
+
+
+def test_landmarks_in_one_place_are_named_as_the_user_counts_them():
+    """Whatever is fitted to a part of them later: the lips apart, or the points of another scheme alone."""
+    shape = makehuman.template()
+    marks = shape.vertices[shape.landmarks].astype(np.float64)
+    marks[63] = marks[61]
+    with pytest.raises(ValueError, match="landmarks 61 and 63 are in one place"):
+        attachment.weights(shape.vertices, shape.faces, marks, lips=attachment.IBUG_LIPS)
