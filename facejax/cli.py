@@ -57,7 +57,8 @@ class Animate:
     mesh: Path | None = None
     """Any face or head (PLY, OBJ, GLB, NPZ), in any topology, unit and pose. Default: a MakeHuman face."""
     landmarks: Path | None = None
-    """Its 68, 51 or 83 landmarks: JSON of vertices or positions, MeshLab .pp, or plain text."""
+    """Its 68, 51 or 83 landmarks: JSON of vertices or positions, MeshLab .pp, or plain text. MakeHuman's head, 3,260
+    vertices, goes without."""
     expression: str | None = None
     """Driven by an expression network: anger, disgust, fear, happiness, sadness or surprise."""
     end: str | None = None
@@ -205,6 +206,8 @@ def _animate(command: Animate) -> None:
         )
     if command.mesh is None and command.landmarks is not None:
         raise ValueError(f"--landmarks {command.landmarks}: of which mesh? name it with --mesh")
+    if command.mesh is not None and command.person is not None:
+        raise ValueError(f"--person {command.person} and --mesh {command.mesh}: name one of them")
     person = None if command.person is None else makehuman.subject(command.person)
     shown = {"fps": command.fps, "formats": command.formats}
     if command.livelink is not None:

@@ -150,11 +150,13 @@ def animate(
     face = animation.prepare(vertices, triangles, marks, template, name=str(mesh or name), **options)
     moved = np.asarray(animation.move(face, motion.curve, intensity=intensity, head=head))
     marks = np.asarray(animation.landmarks_of(face, motion.curve, intensity=intensity))
-    extras = ()
-    if len(face.landmarks) == dress.IBUG and dress.has_eye_holes(face.vertices, face.faces, face.landmarks):
+    extras, notes = (), motion.notes + face.notes
+    if len(face.landmarks) != dress.IBUG:
+        notes += (f"eyes and teeth are drawn for {dress.IBUG} landmarks only",)
+    elif dress.has_eye_holes(face.vertices, face.faces, face.landmarks):
         extras = dress.parts(models.props, face.landmarks, marks)
     shot = io.scene.make(moved, face.faces, captions=motion.captions, landmarks=marks, extras=extras)
-    return _write(out, f"{name}-{results.stem([motion.name])}", shot, rate, formats), motion.notes + face.notes
+    return _write(out, f"{name}-{results.stem([motion.name])}", shot, rate, formats), notes
 
 
 def play(

@@ -265,6 +265,7 @@ def test_bad_requests_to_animate_get_one_line(capsys, tmp_path, networks, odd_he
     assert "got --expression and --end" in told(*ours, "--end", "anger")
     assert "'feer': did you mean fear" in told("--expression", "feer", "--model", networks)
     assert "--landmarks is missing" in told(*ours, "--mesh", mesh)
+    assert "name one of them" in told(*ours, "--mesh", mesh, "--landmarks", marks, "--person", "3")
     assert "of which mesh?" in told(*ours, "--landmarks", marks)
     assert "no such file" in told(*ours, "--mesh", tmp_path / "no.obj", "--landmarks", marks)
     assert "kernel: expected one of" in told(*ours, "--kernel", "cubic")

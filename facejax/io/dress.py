@@ -43,11 +43,13 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
     if neutral.shape != (IBUG, 3) or len(template.landmarks) != IBUG:
         return ()
     found = []
+    # A face may look anywhere; its eyes look with it.
+    gaze = np.asarray(_fit(template.landmarks, neutral, range(IBUG), scaling=True).rotation)[:, 2]
     for side, lids in enumerate(EYES):
         fit = _fit(template.landmarks, neutral, lids, scaling=True)
         centre = np.asarray(align.apply(fit, template.eye_centre[side : side + 1]))[0]
         radius = float(fit.scale) * float(template.eye_radius[side])
-        found.append(props.eyeball(centre, radius, iris_radius=min(5.9, 0.45 * radius)))
+        found.append(props.eyeball(centre, radius, gaze=gaze, iris_radius=min(5.9, 0.45 * radius)))
     fit = _fit(template.landmarks, neutral, MOUTH, scaling=True)
     upper, lower = (
         np.asarray(align.apply(fit, _behind_the_lips(teeth))) for teeth in (template.upper_teeth, template.lower_teeth)

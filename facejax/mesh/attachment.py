@@ -40,7 +40,7 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
     pairs = cKDTree(landmarks).query_pairs(rbf.COINCIDENT * spread)
     if pairs:
         a, b = min(pairs)
-        raise ValueError(f"landmarks {a} and {b} are in one place, {landmarks[a]}: move one, or leave it out")
+        raise ValueError(f"landmarks {a} and {b} are in one place, {landmarks[a]}: move one of them")
     limit = np.maximum(OFF_MESH * spread, ring)
     worst = int(np.argmax(distance - limit))
     if distance[worst] > limit[worst]:

@@ -33,3 +33,11 @@ def test_lower_teeth_follow_the_jaw_and_upper_teeth_stay(template, template_prop
 
 def test_another_landmark_scheme_goes_bare(template_props):
     assert dress.parts(template_props, np.zeros((51, 3)), np.zeros((2, 51, 3))) == ()
+
+
+def test_eyes_look_where_the_face_looks(template, template_props):
+    turn = np.array([[0.5**0.5, 0, 0.5**0.5], [0, 1, 0], [-(0.5**0.5), 0, 0.5**0.5]])
+    rest = template.vertices[template.landmarks] @ turn.T
+    for eye in dress.parts(template_props, rest, rest[None])[:2]:
+        pupil = eye.vertices[np.asarray(eye.colour).max(axis=1) < 0.1].mean(axis=0) - eye.vertices.mean(axis=0)
+        np.testing.assert_allclose(pupil / np.linalg.norm(pupil), turn[:, 2], atol=0.05)
