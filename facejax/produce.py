@@ -147,7 +147,8 @@ def animate(
         name = mesh.stem
     vertices, triangles, marks = _mesh(models.face, mesh, landmarks, person)
     template = models.face.vertices[models.face.landmark_index]
-    face = animation.prepare(vertices, triangles, marks, template, name=str(mesh or name), **options)
+    source = str(mesh or name) + (f" with {landmarks}" if landmarks else "")
+    face = animation.prepare(vertices, triangles, marks, template, name=source, **options)
     moved = np.asarray(animation.move(face, motion.curve, intensity=intensity, head=head))
     marks = np.asarray(animation.landmarks_of(face, motion.curve, intensity=intensity))
     extras, notes = (), motion.notes + face.notes
