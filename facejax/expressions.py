@@ -52,7 +52,7 @@ def load(path: str | os.PathLike | None = None) -> Expressions:
 
 
 def save(path: str | os.PathLike, networks: Expressions) -> None:
-    """Write networks to one safetensors file, in half precision: it changes a curve by a thousandth."""
+    """Write networks to one safetensors file, in half precision: curves change by 2 parts in 10,000."""
     halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), networks.params.weights)
     described = {
         "labels": list(networks.labels),

@@ -7,9 +7,9 @@ Vocabulary: T steps, B sequences side by side, D numbers in and out, H units a l
 ...): a scan reads them as they lie. Weights are {"layers": [{"input" (D or H, 4H), "hidden" (H, 4H), "bias" (4H,)}],
 "dense": {"kernel" (H, D), "bias" (D,)}}; every sequence starts from a state of zeros.
 
-JAX differentiates a scan by adding one outer product a step to every weight's gradient: 59 ms instead of 17 for three
-layers of 128, 135 steps and 5 sequences on 2 cores. Both backward passes here keep the derivative of each step's
-gates instead and multiply once at the end.
+JAX differentiates a scan by adding one outer product a step to every weight's gradient: 31 ms instead of 15 for three
+layers of 128, 135 steps and 5 sequences of 204 numbers on 2 cores. Both backward passes here keep the derivative of
+each step's gates instead and multiply once at the end.
 """
 
 from __future__ import annotations
