@@ -76,8 +76,7 @@ def finish(
     """Write the config, the metrics with their record, and the table; publish them if asked."""
     out = Path(config.out)
     document = {**metrics, "made": made}
-    plain = {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(config).items()}
-    write_text(out / "config.json", json.dumps(plain, indent=1) + "\n")
+    write_text(out / "config.json", json.dumps(dataclasses.asdict(config), indent=1, default=_plain) + "\n")
     write_text(out / "metrics.json", json.dumps(document, indent=1, default=_plain) + "\n")
     source = f"`{made['command']}` in {made['seconds']:.0f} s (commit {made['commit']}, {made['date']})"
     body = f"{table}\n\nMade by {source}.\n"

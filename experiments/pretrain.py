@@ -1,10 +1,15 @@
-"""Train the released models on makehuman4d: Motion3DGAN and S2D-Dec, apart, then put them into one file.
+"""Train the released models on makehuman4d: the generator of motion and S2D-Dec, apart, then put them into one file.
 
     python -m experiments.pretrain --release
 
 Each stage keeps checkpoints in its folder and goes on from there when it was stopped; the two may run side by side
 (`--stage motion`, `--stage decoder`), and `--stage assemble --release` joins them into the package's
-`facejax/assets/makehuman4d.safetensors`, with the record of how it was made inside. About 40 minutes on 2 cores.
+`facejax/assets/makehuman4d.safetensors`, with the record of how it was made inside. Either network can come from a
+file of weights instead (`--motion FILE`, `--decoder FILE`). About 40 minutes on 2 cores.
+
+The generator of OT23's predecessor, which knows neutral -> peak alone, for `experiments.user_study`:
+
+    python -m experiments.pretrain --onsets-only --decoder facejax/assets/makehuman4d.safetensors --out runs/predecessor
 """
 
 from __future__ import annotations
@@ -19,12 +24,12 @@ import jax
 import numpy as np
 
 from experiments import _run
-from facejax import evaluation, fitting, pipeline
-from facejax.data import assets, cache, makehuman, makehuman4d, motions, store
+from facejax import evaluation, fit_decoder, fit_motion, pipeline
+from facejax.data import assets, cache, makehuman, makehuman4d, motions, performance, store
 from facejax.data.meshes import of_split
 from facejax.io import dress
 from facejax.mesh import topology
-from facejax.models import decoder, starts
+from facejax.models import decoder, generators
 
 PACKAGED = Path(pipeline.__file__).parent / "assets" / pipeline.RELEASED
 
@@ -43,10 +48,20 @@ class Config:
     """Of the dataset."""
     meshes: int = 20_000
     """Of the dataset."""
-    motion_steps: int = fitting.MotionPlan().steps
-    """Generator steps."""
-    decoder_steps: int = fitting.DecoderPlan().steps
+    generator: Literal["flow", "gan"] = "flow"
+    """Which generator of motion."""
+    motion_steps: int | None = None
+    """Generator steps; by default those of its plan."""
+    decoder_steps: int = fit_decoder.Plan().steps
     """Decoder steps."""
+    motion: Path | None = None
+    """Weights whose generator to take, in place of training one."""
+    decoder: Path | None = None
+    """Weights whose decoder to take, in place of training one."""
+    labels: Literal["all", "coma"] = "all"
+    """Of the generator: the dataset's 19, or neutral and the 12 of OT23."""
+    onsets_only: bool = False
+    """Train the generator on neutral -> peak alone."""
     release: bool = False
     """Put the weights into the package."""
     publish: bool = False
@@ -70,7 +85,7 @@ def run(config: Config) -> dict[str, Any]:
     seconds = motion_seconds + decoder_seconds
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"])
     models = pipeline.Models(
-        labels=data.labels,
+        labels=_names(config, data),
         face=pipeline.Face(
             shape.vertices,
             shape.faces,
@@ -83,10 +98,7 @@ def run(config: Config) -> dict[str, Any]:
         starts=beginnings,
         hierarchy=hierarchy,
         decoder=decode,
-        about={
-            "made": made,
-            "plans": {"motion": _motion_plan(config)._asdict(), "decoder": _plan(config)._asdict()},
-        },
+        about={"made": made, "plans": {"motion": _motion_about(config), "decoder": _plan(config)._asdict()}},
     )
     metrics = {
         "error_mm": _errors(models, data),
@@ -100,7 +112,7 @@ def run(config: Config) -> dict[str, Any]:
     rows = [
         ("S2D-Dec, mean vertex error on test subjects, whole head", f"{metrics['error_mm']['head']:.4f} mm"),
         ("the same, face region", f"{metrics['error_mm']['face']:.4f} mm"),
-        ("Motion3DGAN, steps", config.motion_steps),
+        ("generator of motion", generators.kind(models.motion)),
         ("S2D-Dec, steps", config.decoder_steps),
         ("weights", f"{size:.1f} MB"),
     ]
@@ -118,31 +130,57 @@ def _errors(models: pipeline.Models, data: store.Store) -> dict[str, float]:
     return {region: row["mean_mm"] for region, row in found.items()}
 
 
-def _motion_plan(config: Config) -> fitting.MotionPlan:
-    return fitting.MotionPlan(steps=config.motion_steps)
+def _motion_plan(config: Config) -> fit_motion.FlowPlan | fit_motion.GanPlan:
+    plan = fit_motion.FlowPlan() if config.generator == "flow" else fit_motion.GanPlan()
+    return plan if config.motion_steps is None else plan._replace(steps=config.motion_steps)
 
 
-def _plan(config: Config) -> fitting.DecoderPlan:
-    return fitting.DecoderPlan(steps=config.decoder_steps)
+def _motion_about(config: Config) -> dict[str, Any]:
+    if config.motion is not None:
+        return pipeline.load(config.motion).about.get("generator_made", {})
+    return _motion_plan(config)._asdict() | {"labels": config.labels, "onsets_only": config.onsets_only}
+
+
+def _plan(config: Config) -> fit_decoder.Plan:
+    return fit_decoder.Plan(steps=config.decoder_steps)
+
+
+def _names(config: Config, data: store.Store) -> tuple[str, ...]:
+    if config.motion is not None:
+        return pipeline.load(config.motion).labels
+    return data.labels if config.labels == "all" else (performance.NEUTRAL, *performance.COMA)
 
 
 def _motion(config: Config, data: store.Store):
-    examples = fitting.transitions(data, "train")
+    """The generator, the peaks that motions start from, and the seconds it took."""
+    if config.motion is not None:
+        found = pipeline.load(config.motion)
+        return (found.motion, found.starts), 0.0
+    names = _names(config, data)
+
+    def parts(per_pair):
+        if config.onsets_only:
+            halves = motions.halves(data, "train", names=names)
+            return [halves.take(halves.start == 0)]
+        return fit_motion.everything(data, "train", names=names, per_pair=per_pair)
+
     folder = config.out / "motion"
+    fit = fit_motion.fit_flow if config.generator == "flow" else fit_motion.fit_gan
     with _timed(folder) as seconds:
-        generator = fitting.fit_motion(
-            examples, folder, labels=len(data.labels), plan=_motion_plan(config), seed=config.seed
-        )
-    halves = motions.halves(data, "train")
-    onsets = halves.take(halves.start == 0)
-    beginnings = starts.fit(onsets.curves[:, -1], onsets.end, classes=len(data.labels))
+        known = motions.join(*parts(fit_motion.CHARTED))
+        chart = fit_motion.chart_of(known, labels=len(names))
+        examples = fit_motion.examples_of(chart, parts(fit_motion.SPREAD))
+        generator = fit(examples, chart, folder, plan=_motion_plan(config), seed=config.seed)
+    beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train", names=names))
     return (generator, beginnings), seconds()
 
 
 def _decoder(config: Config, data: store.Store, hierarchy):
+    if config.decoder is not None:
+        return pipeline.load(config.decoder).decoder, 0.0
     folder = config.out / "decoder"
     with _timed(folder) as seconds:
-        found = fitting.fit_decoder(of_split(data, "train"), hierarchy, folder, plan=_plan(config), seed=config.seed)
+        found = fit_decoder.fit(of_split(data, "train"), hierarchy, folder, plan=_plan(config), seed=config.seed)
     return found, seconds()
 
 

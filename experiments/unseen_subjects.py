@@ -21,7 +21,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _run
-from facejax import evaluation, fitting, journal, pipeline
+from facejax import evaluation, fit_decoder, journal, pipeline
 from facejax.data import cache, makehuman, makehuman4d, rig
 from facejax.data.meshes import Meshes, of_split
 from facejax.mesh import topology
@@ -57,7 +57,7 @@ def run(config: Config) -> dict[str, Any]:
     begun = time.perf_counter()
     models = pipeline.load()
     released = models.about["plans"]["decoder"]["steps"]
-    plan = fitting.DecoderPlan(steps=config.steps or released)
+    plan = fit_decoder.Plan(steps=config.steps or released)
     rows = []
     for level in config.levels:
         data = makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
@@ -77,7 +77,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _decoder(config: Config, level: int, train: Meshes, plan: fitting.DecoderPlan, models, released: int):
+def _decoder(config: Config, level: int, train: Meshes, plan: fit_decoder.Plan, models, released: int):
     if level == RELEASED_LEVEL and config.steps is None:
         hierarchy, params, steps = models.hierarchy, models.decoder, released
         seconds = models.about["seconds"]["decoder"]
@@ -85,7 +85,7 @@ def _decoder(config: Config, level: int, train: Meshes, plan: fitting.DecoderPla
         shape = makehuman.template()
         hierarchy = jax.device_put(topology.build(shape.vertices, shape.faces, cache=cache.folder()))
         folder = config.out / f"level{level}"
-        params = fitting.fit_decoder(train, hierarchy, folder, plan=plan, seed=config.seed)
+        params = fit_decoder.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
         steps, seconds = plan.steps, sum(entry["seconds"] for entry in journal.read(folder))
     return (lambda marks: decoder.apply(params, hierarchy, marks)), {"steps": steps, "train_seconds": round(seconds, 1)}
 

@@ -6,8 +6,11 @@ neutral-to-peak motions; every point on it is a motion, and their last frames, i
 the first peak to the second. Of the hundreds of thousands of pairs, those nearest to the mean peaks of their
 two expressions ("prototypes") are kept.
 
-`halves`, `transition` and `transitions` are array functions. `prototypes` and `select` choose data once, on
-the host, in NumPy: the number of rows they return depends on the labels.
+The paper walks at an even pace, so that its transitions start and stop at once. Here the walk may go at the pace
+at which the second expression was performed, which has an onset.
+
+`halves`, `transition` and `transitions` are array functions. `prototypes`, `select`, `spread` and `one_of_each`
+choose data once, on the host, in NumPy: the number of rows they return depends on the labels.
 """
 
 from __future__ import annotations
@@ -19,7 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax.geometry import align, sphere
+from facejax.geometry import align, sphere, srvf
+
+PACES = ("even", "performed")
 
 
 class Motions(NamedTuple):
@@ -68,14 +73,15 @@ def transition(
     log_length2: jax.Array,
     start1: jax.Array,
     start2: jax.Array,
+    tau: jax.Array | None = None,
     *,
     frames: int = 30,
 ) -> jax.Array:
     """Landmarks (..., frames, L, 3) that go from the last frame of motion 1 to the last frame of motion 2.
 
-    q1, q2 are (..., T-1, L, 3) on the unit sphere, log lengths (...), starts (..., L, 3). Frame tau in [0, 1]
-    is the last frame of the motion at the fraction tau of the geodesic (eq. 10), its log-length and start
-    interpolated linearly.
+    q1, q2 are (..., T-1, L, 3) on the unit sphere, log lengths (...), starts (..., L, 3). A frame is the last frame
+    of the motion at a fraction tau in [0, 1] of the geodesic (eq. 10), its log-length and start interpolated
+    linearly. `tau` (..., frames) gives the fractions; without it they are even, as in the paper.
     """
     # The last frame of a decoded motion is start + length / (T-1) * sum_t q_t |q_t|: the frames between are
     # not needed. On the geodesic q = a p + b w, with p = q1, w = log(q1, q2), a = cos(tau theta) and
@@ -89,7 +95,9 @@ def transition(
             raise ValueError(f"{name}: expected (..., {q1.shape[-2]}, 3), got shape {jnp.shape(start)}")
     w = sphere.log(q1, q2)
     theta = sphere.norm(w)
-    tau = jnp.linspace(0, 1, frames, dtype=w.dtype)
+    tau = jnp.linspace(0, 1, frames, dtype=w.dtype) if tau is None else jnp.asarray(tau, w.dtype)
+    if tau.shape[-1] != frames:
+        raise ValueError(f"tau: expected (..., {frames}), one fraction per frame, got shape {tau.shape}")
     angle = theta[..., None] * tau
     a, b = jnp.cos(angle)[..., None], (tau * jnp.sinc(angle / jnp.pi))[..., None]
     pp, pw, ww = (jnp.sum(x * y, axis=(-2, -1))[..., None, :] for x, y in ((q1, q1), (q1, w), (w, w)))
@@ -99,15 +107,19 @@ def transition(
     basis = jnp.concatenate(jnp.broadcast_arrays(q1, w), axis=-3)
     moves = jnp.einsum("...ft,...tlc->...flc", weights, basis)
     log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])
-    start = _between(tau[:, None, None], start1[..., None, :, :], start2[..., None, :, :])
+    start = _between(tau[..., None, None], start1[..., None, :, :], start2[..., None, :, :])
     return start + (jnp.exp(log_length) / q1.shape[-3])[..., None, None] * moves
 
 
-def transitions(motions: Motions, pairs: np.ndarray, *, frames: int = 30, chunk: int = 128) -> Iterator[jax.Array]:
+def transitions(
+    motions: Motions, pairs: np.ndarray, *, frames: int = 30, pace: str = "even", chunk: int = 128
+) -> Iterator[jax.Array]:
     """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
 
-    Memory does not grow with P. The last chunk is padded inside, so that all share one compilation. Raises
-    `ValueError` on a malformed or out-of-range pair, before anything is computed.
+    `pace`: "even", or "performed", at which the fraction of the geodesic walked by a frame is the share of its path
+    that the second motion has covered by then. Memory does not grow with P. The last chunk is padded inside, so that
+    all share one compilation. Raises `ValueError` on an unknown pace or a malformed or out-of-range pair, before
+    anything is computed.
     """
     pairs = np.asarray(pairs)
     count = len(motions.q)
@@ -115,9 +127,11 @@ def transitions(motions: Motions, pairs: np.ndarray, *, frames: int = 30, chunk:
         raise ValueError(f"pairs: expected integers (P, 2), got {pairs.dtype} {pairs.shape}")
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")
+    if pace not in PACES:
+        raise ValueError(f"pace: expected one of {PACES}, got {pace!r}")
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < count):
         raise ValueError(f"pairs: expected indices in [0, {count}), got {pairs.min()} to {pairs.max()}")
-    return _stream(motions, pairs, frames, min(chunk, max(len(pairs), 1)))
+    return _stream(motions, pairs, frames, pace, min(chunk, max(len(pairs), 1)))
 
 
 def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.ndarray:
@@ -165,6 +179,40 @@ def select(
     return Selection(np.concatenate(pairs), np.concatenate(distances))
 
 
+def spread(labels: np.ndarray, *, classes: int, per_pair: int | None = None, seed: int = 0) -> np.ndarray:
+    """Index pairs (P, 2) int32 of motions with labels (K,), for each ordered pair of different classes, unselected.
+
+    `per_pair` different ones of each (None, or more than there are: all), in which every start and every end serves
+    equally often, give or take one; who meets whom is drawn. Ordered by class of start, class of end.
+    """
+    if per_pair is not None and per_pair < 1:
+        raise ValueError(f"per_pair: expected at least 1, got {per_pair}")
+    random = np.random.default_rng(seed)
+    members = [np.flatnonzero(np.asarray(labels) == label) for label in range(classes)]
+    pairs = [np.zeros((0, 2), np.int32)]
+    for a, b in ((a, b) for a in range(classes) for b in range(classes) if a != b):
+        first, second = random.permutation(members[a]), random.permutation(members[b])
+        total = len(first) * len(second)
+        if total:
+            k = np.arange(total if per_pair is None else min(per_pair, total))
+            # Both run round; when they would meet as they did at first, one moves on by a place.
+            turn = k // np.lcm(len(first), len(second))
+            pairs.append(np.stack([first[k % len(first)], second[(k + turn) % len(second)]], axis=1).astype(np.int32))
+    return np.concatenate(pairs)
+
+
+def one_of_each(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.ndarray:
+    """A mask (K,) that picks one motion, drawn by seed, of each (start, end) that occurs: OT23's test set."""
+    start, end = np.asarray(start), np.asarray(end)
+    if start.shape != end.shape or start.ndim != 1:
+        raise ValueError(f"start, end: expected two (K,), got {start.shape} and {end.shape}")
+    order = np.random.default_rng(seed).permutation(len(start))
+    _, first = np.unique(np.stack([start, end], axis=1)[order], axis=0, return_index=True)
+    mask = np.zeros(len(start), bool)
+    mask[order[first]] = True
+    return mask
+
+
 def _candidates(starts: int, ends: int, count: int, reuse: int | None) -> tuple[np.ndarray, np.ndarray]:
     """Ranks (M,) of start and end among which the `count` nearest transitions are, without the full product.
 
@@ -190,17 +238,22 @@ def _between(tau: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
     return a + tau * (b - a)
 
 
-@jax.jit(static_argnames=("frames",))
-def _chunk(motions: Motions, pairs: jax.Array, *, frames: int) -> jax.Array:
+@jax.jit(static_argnames=("frames", "pace"))
+def _chunk(motions: Motions, pairs: jax.Array, *, frames: int, pace: str) -> jax.Array:
     first, second = (jax.tree.map(lambda x, rows=rows: x[rows], motions) for rows in pairs.T)
-    return transition(first.q, first.log_length, second.q, second.log_length, first.start, second.start, frames=frames)
+    tau = None
+    if pace == "performed":
+        share = srvf.covered(second.q)
+        tau = align.resample(share[..., None, None], frames=frames)[..., 0, 0] if share.shape[-1] != frames else share
+    ends = first.q, first.log_length, second.q, second.log_length, first.start, second.start
+    return transition(*ends, tau, frames=frames)
 
 
-def _stream(motions: Motions, pairs: np.ndarray, frames: int, chunk: int) -> Iterator[jax.Array]:
+def _stream(motions: Motions, pairs: np.ndarray, frames: int, pace: str, chunk: int) -> Iterator[jax.Array]:
     for begin in range(0, len(pairs), chunk):
         rows = pairs[begin : begin + chunk]
         padded = np.pad(rows, ((0, chunk - len(rows)), (0, 0)))
-        yield _chunk(motions, jnp.asarray(padded, jnp.int32), frames=frames)[: len(rows)]
+        yield _chunk(motions, jnp.asarray(padded, jnp.int32), frames=frames, pace=pace)[: len(rows)]
 
 
 def _check_curve(curve: jax.Array) -> None:

@@ -38,8 +38,8 @@ class Generate:
     """Another seed, another motion."""
     samples: int = 1
     """How many motions to draw."""
-    frames: int = 30
-    """Frames of each transition."""
+    frames: int | Literal["natural"] = 30
+    """Frames of each transition; "natural": as long as people take, generated with the motion."""
     fps: float = 30.0
     """Frames per second of the results."""
     intensity: float = 1.0
@@ -77,8 +77,8 @@ class Animate:
     """With --livelink: take the weights as they are, not relative to the person's resting face."""
     person: int | None = None
     """Without --mesh: which MakeHuman person (100 to 119 are test subjects). Default: the average face."""
-    frames: int | None = None
-    """Frames of each transition (30), or at most of an expression."""
+    frames: int | Literal["natural"] | None = None
+    """Frames of each transition (30; "natural": as long as people take), or at most of an expression."""
     whole: bool = False
     """With --expression: go on to the last frame, though the expression is over."""
     seed: int = 7
@@ -223,12 +223,15 @@ def _animate(command: Animate) -> None:
             )
         motion = drive.by_recording(recording, name=name)
     elif command.expression is not None:
+        if command.frames == drive.NATURAL:
+            raise ValueError("--frames natural is of transitions; an expression takes its own time without --frames")
         motion = drive.by_expression(
             command.expression, frames=command.frames, whole=command.whole, weights=command.model
         )
     else:
         labels = (command.start, command.end, *command.then)
-        motion = drive.by_labels(labels, seed=command.seed, frames=command.frames or 30, weights=command.model)
+        frames = 30 if command.frames is None else command.frames
+        motion = drive.by_labels(labels, seed=command.seed, frames=frames, weights=command.model)
     options = {
         "head": command.head,
         "pin": command.pin,

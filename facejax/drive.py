@@ -15,6 +15,7 @@ import numpy as np
 from facejax import expressions, pipeline
 from facejax.data import livelink, makehuman, rig
 
+NATURAL = "natural"  # as many frames as people take
 LEVEL = 3  # of the rig that a recording drives
 
 
@@ -50,9 +51,16 @@ def by_expression(
     return Motion(np.asarray(curve), label, ((0, label),), networks.rate)
 
 
-def by_labels(labels: Sequence[str], *, seed: int = 7, frames: int = 30, weights: Path | None = None) -> Motion:
-    """Motion3DGAN's motion through two or more labels. Raises as `pipeline.displacements`."""
+def by_labels(
+    labels: Sequence[str], *, seed: int = 7, frames: int | Sequence[int] | str = 30, weights: Path | None = None
+) -> Motion:
+    """A generated motion through two or more labels; `frames` as in `pipeline.landmarks`, or "natural".
+
+    Raises as `pipeline.displacements`.
+    """
     models = pipeline.load(weights)
+    if frames == NATURAL:
+        frames = pipeline.durations(models, jax.random.key(seed), labels)
     curve = pipeline.displacements(models, jax.random.key(seed), labels, samples=1, frames=frames)[0]
     return Motion(np.asarray(curve), "_".join(labels), pipeline.captions(labels, frames=frames), pipeline.RATE)
 

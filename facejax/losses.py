@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from facejax.geometry import sphere
 from facejax.geometry.sphere import root
 
 Sample = Any
@@ -77,6 +78,27 @@ def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
     """
     _same_shape(predicted, target)
     return jnp.mean(jnp.abs(predicted - target))
+
+
+def flow_matching(
+    field: Callable, key: jax.Array, source: Sample, target: Sample, condition: Condition, unit: jax.Array
+) -> jax.Array:
+    """How far a velocity field is from the velocities of the geodesics between samples of source and target.
+
+    Samples are (y, s): y (B, 1, 1, C) on a unit sphere, s (B, S). `field(state, time, condition) -> (v, rate)` handles
+    ONE state, and gives a tangent vector at y and the rate of s. One time in [0, 1) per sample. Along a geodesic the
+    velocity is log(source, target), carried along. Squares are taken in units of `unit` (B, C) along y's entries, so
+    that narrow directions count as much as wide ones; the mean is over all entries. Chen & Lipman 2024, eq. 15.
+    """
+    (y0, s0), (y1, s1) = source, target
+    time = jax.random.uniform(key, y0.shape[:1])
+    way = sphere.log(y0, y1)
+    y = sphere.exp(y0, time[:, None, None, None] * way)
+    wanted = sphere.transport(y0, y, way)
+    between = y, s0 + time[:, None] * (s1 - s0)
+    found, rate = jax.vmap(field)(between, time, condition)
+    off = (found - wanted)[:, 0, 0] / unit
+    return jnp.mean(jnp.concatenate([off, rate - (s1 - s0)], axis=-1) ** 2)
 
 
 @jax.jit

@@ -2,7 +2,7 @@
 
 Meshes are (..., N, 3), motions (..., T, L, 3). The distance of two motions is the Euclidean distance per
 landmark, averaged over landmarks and frames. Specificity, diversity and their real-data ceilings follow
-Otberdout et al. 2023, section 5, and Davies et al. 2002; compare them at equal counts and for the same label
+Otberdout et al. 2023, section 4.3, and Davies et al. 2002; compare them at equal counts and for the same label
 pairs.
 """
 
@@ -95,6 +95,47 @@ def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
     if jnp.shape(reference)[-3:] != samples.shape[-3:]:
         raise ValueError(f"reference: expected (..., {samples.shape[-3:]}), got {jnp.shape(reference)}")
     return jnp.mean(_norm(samples - reference[..., None, :, :, :]), axis=(-3, -2, -1))
+
+
+@jax.jit
+def distances(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The distance (K, M) of each motion of a (K, T, L, 3) to each of b (M, T, L, 3)."""
+    _check_motion(a, 1, axes=4)
+    _check_motion(b, 1, axes=4)
+    if a.ndim != 4 or b.ndim != 4 or a.shape[1:] != b.shape[1:]:
+        raise ValueError(f"expected (K, T, L, 3) and (M, T, L, 3), got {a.shape} and {b.shape}")
+    return jax.lax.map(lambda one: _motion_distance(one, b), a)
+
+
+@jax.jit
+def mean_off_diagonal(own: jax.Array) -> jax.Array:
+    """The mean () of a square table (K, K), K >= 2, without its diagonal."""
+    if own.ndim != 2 or own.shape[0] != own.shape[1] or len(own) < 2:
+        raise ValueError(f"expected (K, K) with K >= 2, got {own.shape}")
+    return (jnp.sum(own) - jnp.trace(own)) / (len(own) * (len(own) - 1))
+
+
+@jax.jit(static_argnames=("neighbours",))
+def coverage(across: jax.Array, real: jax.Array, *, neighbours: int = 5) -> jax.Array:
+    """The share () of real motions near which one was generated; tables (K, M) and (M, M) of `distances`.
+
+    Near: within the distance of the real motion's neighbour of that rank among the real. Naeem et al. 2020.
+    """
+    if across.shape[1:] != real.shape[:1] or not 0 < neighbours < len(real):
+        raise ValueError(f"expected (K, M) and (M, M) with M > {neighbours}, got {across.shape} and {real.shape}")
+    radius = jnp.sort(real, axis=1)[:, neighbours]  # entry 0 is the motion itself
+    return jnp.mean(jnp.min(across, axis=0) < radius)
+
+
+@jax.jit
+def energy_distance(across: jax.Array, drawn: jax.Array, real: jax.Array) -> jax.Array:
+    """How far two sets of motions are from one distribution, from tables (K, M), (K, K) and (M, M) of `distances`.
+
+    2 E|X - Y| - E|X - X'| - E|Y - Y'|, over the last; 0 for equal distributions. Szekely & Rizzo 2013. Without
+    bias: two samples of one distribution give 0 in the mean, and may give less.
+    """
+    spread = mean_off_diagonal(real)
+    return (2 * jnp.mean(across) - mean_off_diagonal(drawn) - spread) / spread
 
 
 @jax.jit

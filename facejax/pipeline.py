@@ -10,7 +10,6 @@ Millimetres. A neutral face is (N, 3) vertices in the models' topology; T frames
 from __future__ import annotations
 
 import difflib
-import functools
 import os
 from collections.abc import Sequence
 from importlib import resources
@@ -21,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from facejax import weights
-from facejax.geometry import align, srvf
+from facejax import composition, weights
 from facejax.io import dress
 from facejax.mesh import topology
-from facejax.models import charts, decoder, motion, starts
+from facejax.models import charts, decoder, generators, starts
 
-RATE = 30.0  # frames per second of the motions that the generator learnt
+RATE = 30.0  # frames per second at which motions are played
+FRAMES = 30  # of a transition, as the generator learnt them
 RELEASED = "makehuman4d.safetensors"
 
 
@@ -47,8 +46,8 @@ class Models(NamedTuple):
     labels: tuple[str, ...]  # neutral first
     face: Face
     props: dress.Props  # eyes and teeth of the template, for pictures; without landmarks: none
-    motion: motion.Params
-    starts: starts.Params  # where a motion starts that does not start at neutral
+    motion: generators.Params
+    starts: starts.Params  # peaks from which a motion starts that does not start at neutral
     hierarchy: Any
     decoder: Any
     about: dict[str, Any]  # how the weights were made
@@ -59,7 +58,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
     path = path or resources.files("facejax.assets").joinpath(RELEASED)
     about = weights.load_metadata(path)
     try:
-        like = _structure(about["shapes"])
+        like = _structure(about["shapes"], about["generator"])
     except (KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
     tree, about = weights.load(path, like)
@@ -75,7 +74,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
 def save(path: str | os.PathLike, models: Models) -> None:
     """Write models to one safetensors file; `about` gains what `load` needs."""
     tree = models._asdict()
-    about = tree.pop("about") | {"labels": list(tree.pop("labels"))}
+    about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
     tree["hierarchy"] = topology.save(models.hierarchy)
     leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
     weights.save(path, tree, metadata=about | {"shapes": leaves})
@@ -88,14 +87,14 @@ def landmarks(
     neutral: np.ndarray | jax.Array,
     *,
     samples: int | None = None,
-    frames: int = 30,
+    frames: int | Sequence[int] = FRAMES,
     intensity: float = 1.0,
 ) -> jax.Array:
     """Landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`.
 
-    `frames` is the length of one transition; T = 1 + (frames - 1) x transitions, joints not repeated. A motion that
-    does not start at neutral starts at a peak drawn for it (`facejax.models.starts`), scaled to the face. `intensity`
-    scales all displacements from neutral.
+    `frames` is the length of one transition, or one number for each; T = 1 + sum of (frames - 1), joints not repeated.
+    `durations` gives natural ones. A motion that does not start at neutral starts at a peak drawn for it
+    (`facejax.models.starts`), scaled to the face. `intensity` scales all displacements from neutral.
 
     Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
     """
@@ -108,19 +107,34 @@ def landmarks(
 
 
 def displacements(
-    models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int = 30
+    models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int | Sequence[int] = FRAMES
 ) -> jax.Array:
     """Displacements from neutral (S, T, L, 3) through `labels`, unitless: divided by the face's landmark norm."""
-    indices = label_indices(models, labels)
-    if len(indices) < 2:
-        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
-    for before, after in zip(labels[:-1], labels[1:], strict=True):
-        if before == after:
-            raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")
-    if frames < 2 or samples < 1:
-        raise ValueError(f"frames must be 2 or more and samples 1 or more, got {frames} and {samples}")
-    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
-    return _compose(models.motion, models.starts, jax.random.split(key, samples), pairs, frames=frames)
+    drawn = _draw(models, key, labels, samples)
+    line = composition.timeline(lengths(labels, frames), drawn=drawn.curves.shape[2])
+    return composition.join(drawn.curves, jnp.asarray(line))
+
+
+def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: float = RATE) -> tuple[int, ...]:
+    """How many frames each transition takes at `rate` frames per second, as people perform it.
+
+    Generated with the motion: give `landmarks` the same key, and these as its `frames`. Of several samples, the first.
+    """
+    if not rate > 0:
+        raise ValueError(f"rate must be above 0 frames per second, got {rate}")
+    seconds = np.exp(np.asarray(_draw(models, key, labels, 1).log_seconds[0]))
+    return tuple(max(2, 1 + round(float(x) * rate)) for x in seconds)
+
+
+def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ...]:
+    """One length for each transition. Raises `ValueError` for another number of them, or fewer than two frames."""
+    count = len(labels) - 1
+    found = (frames,) * count if np.ndim(frames) == 0 else tuple(frames)
+    if len(found) != count:
+        raise ValueError(f"frames: expected one number, or {count} for {count} transitions, got {len(found)}")
+    if any(n != int(n) or n < 2 for n in found):
+        raise ValueError(f"frames: expected whole numbers of 2 or more, got {frames}")
+    return tuple(int(n) for n in found)
 
 
 def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array) -> jax.Array:
@@ -131,10 +145,11 @@ def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 
 
-def captions(labels: Sequence[str], *, frames: int = 30) -> tuple[tuple[int, str], ...]:
+def captions(labels: Sequence[str], *, frames: int | Sequence[int] = FRAMES) -> tuple[tuple[int, str], ...]:
     """(first frame, "neutral → high_smile") of each transition."""
+    begins = np.cumsum([0] + [count - 1 for count in lengths(labels, frames)])
     pairs = zip(labels[:-1], labels[1:], strict=True)
-    return tuple((i * (frames - 1), f"{start} → {end}") for i, (start, end) in enumerate(pairs))
+    return tuple((int(begin), f"{start} → {end}") for begin, (start, end) in zip(begins, pairs, strict=False))
 
 
 def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Array:
@@ -155,43 +170,19 @@ def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
     return np.array([models.labels.index(name) for name in labels], np.int32)
 
 
-@functools.partial(jax.jit, static_argnames="frames")
-def _compose(generator, beginnings, keys, pairs, *, frames):
-    """Unitless displacements from neutral (S, T, L, 3) through P transitions (P, 2)."""
-
-    def one(key):
-        def transition(displacement, inputs):
-            key, first, (start, end) = inputs
-            motion_key, start_key = jax.random.split(key)
-            q, log_length = motion.sample(generator, motion_key, start, end)
-            travel = srvf.decode(q, log_length, jnp.zeros_like(displacement))[-1]
-            # The motion was made for somebody who starts there, and ends at a peak of `end`.
-            meant = starts.sample(beginnings, start_key, travel, start, end)
-            here = jnp.where(first, meant, displacement)
-            curve = _settle(srvf.decode(q, log_length, meant), here)
-            if frames != curve.shape[0]:
-                curve = align.resample(curve, frames=frames)
-            return curve[-1], curve
-
-        first = jnp.arange(len(pairs)) == 0
-        inputs = (jax.random.split(key, len(pairs)), first, pairs)
-        _, curves = jax.lax.scan(transition, jnp.zeros_like(beginnings.mean[0]), inputs)
-        rest = curves[:, 1:].reshape(-1, *curves.shape[2:])
-        return jnp.concatenate([curves[0, :1], rest])
-
-    return jax.vmap(one)(keys)
-
-
-def _settle(curve: jax.Array, start: jax.Array) -> jax.Array:
-    """Let a curve (T, L, 3) begin at `start` (L, 3), and end where it was going.
-
-    The generator knows labels, not where the face stands. Added up as they come, transitions would drift ever further
-    from any face; here what separates the two beginnings fades in proportion to the path covered: no jump, no motion
-    where there was none, and every transition ends at a peak of its own label. A way home ends at neutral exactly.
-    """
-    steps = jnp.sqrt(jnp.sum(jnp.diff(curve, axis=0) ** 2, axis=(1, 2)))
-    covered = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)]) / jnp.maximum(jnp.sum(steps), 1e-12)
-    return curve + (1 - covered)[:, None, None] * (start - curve[0])
+def _draw(models: Models, key: jax.Array, labels: Sequence[str], samples: int) -> composition.Drawn:
+    indices = label_indices(models, labels)
+    if len(indices) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+    for before, after in zip(labels[:-1], labels[1:], strict=True):
+        if before == after:
+            raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")
+    if samples < 1:
+        raise ValueError(f"samples must be 1 or more, got {samples}")
+    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
+    # Sample i is the same whatever the number of samples.
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(samples))
+    return composition.draw(models.motion, models.starts, keys, pairs)
 
 
 @jax.jit
@@ -199,7 +190,7 @@ def _decode(params, hierarchy, displacements, neutral):
     return neutral + decoder.apply(params, hierarchy, displacements)
 
 
-def _structure(shapes: dict[str, list]) -> dict[str, Any]:
+def _structure(shapes: dict[str, list], generator: str) -> dict[str, Any]:
     """The tree to expect, rebuilt from the leaf names, dtypes and shapes that a file states.
 
     Raises `KeyError` or `TypeError` where the names are not those of our records.
@@ -210,11 +201,12 @@ def _structure(shapes: dict[str, list]) -> dict[str, Any]:
     networks = {}
     for name in ("motion", "decoder"):
         weights = nested[name]["weights"]
-        networks[name] = weights | {key: _listed(weights[key]) for key in ("blocks", "convs") if key in weights}
+        lists = ("blocks", "gates", "convs")
+        networks[name] = weights | {key: _listed(weights[key]) for key in lists if key in weights}
     return {
         "face": Face(**nested["face"]),
         "props": dress.Props(**nested["props"]),
-        "motion": motion.Params(charts.Chart(**nested["motion"]["chart"]), networks["motion"]),
+        "motion": generators.KINDS[generator](charts.Chart(**nested["motion"]["chart"]), networks["motion"]),
         "starts": starts.Params(**nested["starts"]),
         "hierarchy": tables,
         "decoder": decoder.Params(decoder.Scale(**nested["decoder"]["scale"]), networks["decoder"]),

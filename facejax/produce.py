@@ -21,17 +21,22 @@ def generate(
     model: Path | None = None,
     seed: int = 7,
     samples: int = 1,
-    frames: int = 30,
+    frames: int | Sequence[int] | str = pipeline.FRAMES,
     fps: float = 30.0,
     intensity: float = 1.0,
     formats: Sequence[str] = ("glb", "html", "webp"),
 ) -> list[Path]:
-    """Animate a neutral face (N, 3) through labels, and write every sample in every format. Returns the files."""
+    """Animate a neutral face (N, 3) through labels, and write every sample in every format. Returns the files.
+
+    `frames` as in `pipeline.landmarks`, or "natural": as long as people take, generated with the first sample.
+    """
     results.compile_cache()
     models = pipeline.load(model)
     pipeline.label_indices(models, labels)
     results.check_formats(formats)
     results.check_rate(fps)
+    if frames == drive.NATURAL:
+        frames = pipeline.durations(models, jax.random.key(seed), labels, rate=fps)
     landmarks = pipeline.landmarks(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )

@@ -63,7 +63,7 @@ def writable(folder: Path) -> None:
 
 
 def scene_of(
-    models: pipeline.Models, neutral: np.ndarray, vertices: np.ndarray, marks: np.ndarray, labels, frames: int
+    models: pipeline.Models, neutral: np.ndarray, vertices: np.ndarray, marks: np.ndarray, labels, frames
 ) -> io.scene.Scene:
     """A generated animation with eyes, teeth and captions: neutral (N, 3), vertices (T, N, 3), marks (T, L, 3)."""
     rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
@@ -91,7 +91,7 @@ def save(out: Path, stem: str, suffix: str, scene: io.scene.Scene, fps: float) -
     return path
 
 
-def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], frames: int, fps: float) -> Path:
+def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], frames, fps: float) -> Path:
     """An NPZ of the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
     starts = np.array([start for start, _ in pipeline.captions(labels, frames=frames)])
     with files.replacing(path) as temporary:

@@ -42,6 +42,17 @@ def start_supervised(params: Tree, optimiser: optax.GradientTransformation, key:
     return TrainState(jnp.int32(0), params, optimiser.init(params), key)
 
 
+def averaged(step: Step, decay: float) -> Step:
+    """`step`, and in `extra` the exponential moving average of the parameters; let it start as the parameters."""
+
+    def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
+        following, metrics = step(state, batch, constants)
+        average = optax.incremental_update(following.params, state.extra, 1.0 - decay)
+        return following._replace(extra=average), metrics
+
+    return stepped
+
+
 def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
     """One step of E models that know nothing of each other: parameters, optimiser states, batches stacked, (E, ...).
 

@@ -58,6 +58,7 @@ CASES = {
     "srvf.encode": (lambda lead: (curve(lead),), {}),
     "srvf.decode": (lambda lead: (point(lead, 1), array(2, *lead), array(3, *lead, L, 3)), {}),
     "srvf.displacement": (lambda lead: (point(lead, 1), array(2, *lead)), {}),
+    "srvf.covered": (lambda lead: (point(lead, 1),), {}),
     "srvf.length": (lambda lead: (curve(lead),), {}),
     "align.centre": (lambda lead: (array(1, *lead, L, 3),), {}),
     "align.normalise": (lambda lead: (curve(lead), array(2, *lead, L, 3)), {}),

@@ -6,14 +6,17 @@ import pytest
 
 from experiments import (
     classification,
+    composed,
     dataset_card,
     expression_lstm,
+    generators,
     motion_quality,
     pretrain,
     rbf_warp,
+    specificity,
     unseen_subjects,
 )
-from facejax import evaluation, expressions
+from facejax import evaluation, expressions, fit_motion
 
 TINY = {"subjects": 6, "meshes": 260}
 
@@ -98,11 +101,56 @@ def test_rbf_warp(own_cache, tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.slow
-def test_classification(tmp_path):
-    classification.run(classification.Config(out=tmp_path / "o", samples=2, trees=20))
-    metrics = check(tmp_path / "o", "accuracy_generated", "accuracy_real", "accuracy_direct")
-    assert metrics["accuracy_real"] > 0.9
+PEOPLE = {"level": 1, "people": 6, **TINY}
+
+
+def test_generators(own_cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(fit_motion, "SPREAD", 2)
+    monkeypatch.setattr(fit_motion, "CHARTED", 2)
+    config = generators.Config(out=tmp_path / "o", variants=("gaussian", "flow"), seeds=(0, 1), flow_steps=2, **PEOPLE)
+    generators.run(config)
+    metrics = check(tmp_path / "o", "chosen", "validation", "real", "per_seed")
+    assert metrics["chosen"] in ("gaussian", "flow")
+    assert [metrics["validation"][name]["seeds"] for name in ("gaussian", "flow")] == [1, 2]
+    before = (tmp_path / "o" / "flow-1.safetensors").stat().st_mtime_ns
+    generators.run(config)  # nothing is trained again
+    assert (tmp_path / "o" / "flow-1.safetensors").stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match="--variants: unknown diffusion; there are gaussian, flow"):
+        generators.run(generators.Config(out=tmp_path / "o", variants=("diffusion",)))
+
+
+def test_the_generator_is_chosen_within_the_bounds_of_real_people():
+    real = {"accuracy": 0.99}
+    row = {"accuracy": 0.98, "specificity_all_mm": 1.0, "real_all_mm": 1.0, "diversity_ratio": 1.0}
+    row |= {"acceleration_ratio": 1.0, "energy": 0.2}
+    table = {"flow": row, "gan": row | {"energy": 0.1, "diversity_ratio": 0.7}, "gaussian": row | {"energy": 0.3}}
+    assert generators.chosen(table, real) == "flow"
+    assert generators.chosen({"gan": table["gan"]}, real) == "gan"
+    for broken in ({"accuracy": 0.95}, {"specificity_all_mm": 1.2}, {"acceleration_ratio": 1.4}):
+        assert not generators.meets(row | broken, real)
+
+
+def test_specificity(own_cache, tmp_path):
+    specificity.run(specificity.Config(out=tmp_path / "o", samples=4, **PEOPLE))
+    metrics = check(tmp_path / "o", "specificity_mm", "specificity_real_mm", "diversity_ratio", "acceleration_ratio")
+    assert len(metrics["per_transition"]) == 39 and metrics["people"] == 7
+    assert all(row["specificity_mm"] > 0 for row in metrics["per_transition"].values())
+
+
+def test_classification(own_cache, tmp_path):
+    classification.run(classification.Config(out=tmp_path / "o", samples=2, trees=10, **PEOPLE))
+    metrics = check(tmp_path / "o", "accuracy_generated", "accuracy_real", "accuracy_unselected", "accuracy_direct")
+    assert len(metrics["per_transition"]) == 39
+    assert metrics["accuracy_real"] > 0.5 and metrics["accuracy_generated"] > 0.5
+
+
+def test_composed(own_cache, tmp_path):
+    composed.run(composed.Config(out=tmp_path / "o", samples=2, chains=1, **PEOPLE))
+    metrics = check(tmp_path / "o", "davies_ratio", "from_neutral_at_the_end_mm", "joint_acceleration_ratio")
+    assert metrics["from_neutral_at_the_end_mm"] < 1e-4 and metrics["gap_mm"] < 1e-4
+    assert metrics["joint_acceleration_ratio"] < 0.01 < metrics["joint_acceleration_ratio_unmatched"]
+    assert [len(curve) for curve in metrics["error_per_frame_mm"].values()] == [88] * 5
+    assert {p.name for p in (tmp_path / "o").glob("*.png")} == {"composed.png", "chain.png"}
 
 
 @pytest.mark.slow

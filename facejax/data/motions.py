@@ -6,7 +6,7 @@ figures can be given in millimetres. Halves are neutral -> peak (onset to the st
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class Motions(NamedTuple):
     end: np.ndarray  # (K,) int32
     subject: np.ndarray  # (K,) int32, of the start where two subjects were combined
     scale: np.ndarray  # (K,) millimetres per unit
+    seconds: np.ndarray  # (K,) how long it took; where two subjects were combined, the onset of the end
 
     def take(self, which: np.ndarray) -> Motions:
         """The motions at indices, or under a mask."""
@@ -37,15 +38,24 @@ class Motions(NamedTuple):
         return self.curves * self.scale[:, None, None, None]
 
 
-def halves(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
-    """Every neutral -> peak and peak -> neutral motion of a split's subjects."""
+def halves(
+    data: store.Store, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
+) -> Motions:
+    """Every neutral -> peak and peak -> neutral motion of a split's subjects.
+
+    `names`: labels that count, neutral first, and their numbers; by default all of the dataset. `by`: frames evenly
+    spaced in "time", or along the "arc", which takes onset and apex away.
+    """
+    names = data.labels if names is None else tuple(names)
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=False):
-        label = data.labels.index(sequence.label)
+        if sequence.label not in names:
+            continue
+        label = names.index(sequence.label)
         rise = curve[sequence.onset : sequence.apex_start + 1]
         fall = curve[sequence.apex_end : sequence.offset + 1]
-        rows.append((_resample(rise, frames), 0, label, sequence.subject, scale))
-        rows.append((_resample(fall, frames), label, 0, sequence.subject, scale))
+        for cut, start, end in ((rise, 0, label), (fall, label, 0)):
+            rows.append((_resample(cut, frames, by), start, end, sequence.subject, scale, _seconds(sequence, cut)))
     return _stack(rows)
 
 
@@ -54,24 +64,56 @@ def directs(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=True):
         start, end = (data.labels.index(name) for name in sequence.label.split(">"))
-        rows.append((_resample(curve, frames), start, end, sequence.subject, scale))
+        rows.append((_resample(curve, frames), start, end, sequence.subject, scale, _seconds(sequence, curve)))
     return _stack(rows)
 
 
-def interpolated(onsets: Motions, labels: int, *, per_pair: int, reuse: int | None, frames: int = FRAMES) -> Motions:
-    """Peak -> peak transitions on the geodesics between onsets: the `per_pair` nearest to the prototypes.
+def interpolated(
+    onsets: Motions,
+    labels: int,
+    *,
+    per_pair: int | None,
+    reuse: int | None = None,
+    choice: str = "prototypes",
+    pace: str = "performed",
+    only: Collection[tuple[int, int]] | None = None,
+    seed: int = 0,
+    frames: int = FRAMES,
+    chunk: int = 4096,
+) -> Iterator[Motions]:
+    """Peak -> peak transitions on the geodesics between onsets, `chunk` at a time: memory does not grow with them.
 
-    With `reuse`, no onset serves as the start, or as the end, of more than so many transitions of one pair.
+    `per_pair` of each ordered pair of expressions; None: all. `choice`: "prototypes", the nearest to the mean peaks of
+    the two expressions (OT23; with `reuse`, no onset serves as the start, or as the end, of more than so many
+    transitions of one pair), or "spread", all people equally often. `pace` as in `augment.transitions`; `only`: the
+    (start, end) that are wanted.
     """
+    if choice not in ("prototypes", "spread"):
+        raise ValueError(f'choice: expected "prototypes" or "spread", got {choice!r}')
     q, log_length = srvf.encode(jnp.asarray(onsets.curves))
     motions = augment.Motions(q, log_length, jnp.asarray(onsets.curves[:, 0]))
-    peaks = onsets.curves[:, -1]
-    prototypes = np.zeros((labels, *peaks.shape[1:]))
-    prototypes[1:] = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
-    chosen = augment.select(peaks, onsets.end, prototypes, per_pair=per_pair, reuse=reuse).pairs
-    curves = np.concatenate([np.asarray(c) for c in augment.transitions(motions, chosen, frames=frames)])
-    first, second = chosen.T
-    return Motions(curves, onsets.end[first], onsets.end[second], onsets.subject[first], onsets.scale[first])
+    if choice == "spread":
+        chosen = augment.spread(onsets.end - 1, classes=labels - 1, per_pair=per_pair, seed=seed)
+    else:
+        peaks = onsets.curves[:, -1]
+        prototypes = np.zeros((labels, *peaks.shape[1:]))
+        prototypes[1:] = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
+        everything = len(onsets.curves) ** 2
+        chosen = augment.select(peaks, onsets.end, prototypes, per_pair=per_pair or everything, reuse=reuse).pairs
+    if only is not None:
+        wanted = np.zeros((labels, labels), bool)
+        wanted[tuple(np.array(sorted(only), int).reshape(-1, 2).T)] = True
+        chosen = chosen[wanted[onsets.end[chosen[:, 0]], onsets.end[chosen[:, 1]]]]
+    return _between(onsets, motions, chosen, frames, pace, chunk)
+
+
+def _between(onsets: Motions, motions: augment.Motions, chosen, frames: int, pace: str, chunk: int):
+    for low in range(0, len(chosen), chunk):
+        pairs = chosen[low : low + chunk]
+        curves = [np.asarray(c) for c in augment.transitions(motions, pairs, frames=frames, pace=pace)]
+        first, second = pairs.T
+        own = (onsets.end[first], onsets.end[second], onsets.subject[first], onsets.scale[first])
+        yield Motions(np.concatenate(curves), *own, onsets.seconds[second])
 
 
 def join(*parts: Motions) -> Motions:
@@ -91,9 +133,19 @@ def recordings(data: store.Store, split: str, *, direct: bool) -> Iterator[tuple
             yield sequence, (landmarks - neutral) / scale, scale
 
 
-def _resample(curve: np.ndarray, frames: int) -> np.ndarray:
+def _seconds(sequence: store.Sequence, part: np.ndarray) -> float:
+    return (len(part) - 1) * sequence.duration / sequence.frames
+
+
+def _resample(curve: np.ndarray, frames: int, by: str = "time") -> np.ndarray:
     # In NumPy: every sequence has its own length, and a jitted function would compile for each.
+    if by not in ("time", "arc"):
+        raise ValueError(f'by: expected "time" or "arc", got {by!r}')
     place = np.linspace(0, len(curve) - 1, frames)
+    if by == "arc":
+        steps = np.linalg.norm(np.diff(curve.reshape(len(curve), -1), axis=0), axis=1)
+        covered = np.append(0, np.cumsum(steps + 1e-12))
+        place = np.interp(np.linspace(0, covered[-1], frames), covered, np.arange(len(curve)))
     low = np.minimum(place.astype(int), len(curve) - 2)
     weight = (place - low)[:, None, None].astype(np.float32)
     return curve[low] * (1 - weight) + curve[low + 1] * weight
@@ -102,6 +154,7 @@ def _resample(curve: np.ndarray, frames: int) -> np.ndarray:
 def _stack(rows: list[tuple]) -> Motions:
     if not rows:
         raise ValueError("the dataset has no such motions in this split")
-    curves, start, end, subject, scale = zip(*rows, strict=True)
-    numbers = (np.array(x, np.int32) for x in (start, end, subject))
-    return Motions(np.stack(curves).astype(np.float32), *numbers, np.array(scale, np.float32))
+    curves, *labels, scale, seconds = zip(*rows, strict=True)
+    numbers = (np.array(x, np.int32) for x in labels)
+    sizes = (np.array(x, np.float32) for x in (scale, seconds))
+    return Motions(np.stack(curves).astype(np.float32), *numbers, *sizes)

@@ -81,6 +81,20 @@ def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
 
 
 @jax.jit
+def covered(q: jax.Array) -> jax.Array:
+    """The share (..., T) of its path that the motion q (..., T-1, L, 3) has covered by each frame, from 0 to 1.
+
+    Speed is |q|^2, so this is the time-warp that makes the motion from one of even speed. A motion at standstill has
+    covered 0 throughout.
+    """
+    _check(q, "q", "T-1", 1)
+    speed = jnp.sum(q**2, axis=(-2, -1))
+    total = jnp.sum(speed, axis=-1, keepdims=True)
+    share = jnp.cumsum(speed, axis=-1) / jnp.where(total > 0, total, 1)
+    return jnp.concatenate([jnp.zeros_like(share[..., :1]), share], axis=-1)
+
+
+@jax.jit
 def length(curve: jax.Array) -> jax.Array:
     """Length (...) of the curve (..., T, L, 3) in its own unit: the sum of the norms of its (L, 3) steps."""
     _check(curve, "curve", "T", 2)

@@ -6,7 +6,9 @@ the training set's tangent chart (`facejax.models.charts`). The linear output ba
 that the data do not have, and 5,916 outputs cost no more to train than its R directions. The critic reads
 the same coordinates.
 
-Both networks handle one sample; the caller vmaps. `start`, `end` are label indices, 0 ... K - 1.
+Both networks are told the two labels and the pose that the motion starts from: a mouth that is drawn to the left
+moves otherwise to an open mouth than one that is drawn to the right. Both handle one sample; the caller vmaps.
+`start`, `end` are label indices, 0 ... K - 1; `pose` is (D,), see `charts`.
 """
 
 from collections.abc import Callable
@@ -18,19 +20,20 @@ import jax.numpy as jnp
 
 from facejax.geometry import sphere
 from facejax.models import charts
-from facejax.models.charts import Chart
+from facejax.models.charts import Chart, Motion
 
 Weights = dict[str, Any]
 
 
 class Config(NamedTuple):
-    """Sizes, all static; the default generator and critic count 1.9 M numbers, chart included."""
+    """Sizes, all static; the default generator and critic count 2.0 M numbers, chart included."""
 
     steps: int = 29  # T - 1
     landmarks: int = 68
     labels: int = 19
     noise: int = 128
     rank: int = 128
+    pose: int = 32
     width: int = 384
     blocks: int = 3
     embedding: int = 32
@@ -60,34 +63,31 @@ def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -
     stem_key, label_key, blocks_key = jax.random.split(key, 3)
     weights = {
         "labels": jax.random.normal(label_key, (2, config.labels, config.embedding)),
-        "stem": _dense(stem_key, config.noise + 2 * config.embedding, config.width),
+        "stem": _dense(stem_key, config.noise + config.pose + 2 * config.embedding, config.width),
         "blocks": _blocks(blocks_key, config),
-        "head": _zeros(config.width, config.rank + 1),
-        # Each of the widest directions, and the length, gets a noise of its own.
-        "skip": jnp.eye(config.noise, config.rank + 1),
+        "head": _zeros(config.width, config.rank + charts.SCALARS),
+        # Each of the widest directions, and length and duration, get a noise of their own.
+        "skip": jnp.eye(config.noise, config.rank + charts.SCALARS),
     }
     return Params(chart, weights)
 
 
 @jax.jit
-def _generate_coordinates(params: Params, noise: jax.Array, start, end) -> jax.Array:
-    """Coordinates (R + 1,) from noise (128,) ~ N(0, 1) and two label indices."""
+def _generate_coordinates(params: Params, noise: jax.Array, start, end, pose: jax.Array) -> jax.Array:
+    """Coordinates (2 + R,) from noise (128,) ~ N(0, 1), two label indices and a pose (D,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     _check_noise(noise, weights)
-    hidden = jnp.concatenate([noise, weights["labels"][0, start], weights["labels"][1, end]])
+    hidden = jnp.concatenate([noise, weights["labels"][0, start], weights["labels"][1, end], pose])
     hidden = _residual_stack(weights, hidden, jax.nn.silu)
     deviation = noise @ weights["skip"] + _linear(weights["head"], hidden)
-    unit = jnp.append(1.0, chart.scale[start, end])
-    centre = jnp.append(0.0, chart.mean[start, end])
-    return centre + unit * deviation
+    return charts.expected(chart, start, end, pose) + charts.unit(chart, start, end) * deviation
 
 
 @jax.jit
-def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, jax.Array]:
-    """Tangent vector at p (T-1, L, 3) and log-length () from noise (128,) and two label indices."""
-    return charts.motion(
-        jax.lax.stop_gradient(params.chart), _generate_coordinates(params, noise, start, end), start, end
-    )
+def _generate(params: Params, noise: jax.Array, start, end, pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Tangent vector at p (T-1, L, 3), log-length and log-seconds () from noise (128,), two label indices, a pose."""
+    values = _generate_coordinates(params, noise, start, end, pose)
+    return charts.motion(jax.lax.stop_gradient(params.chart), values, start, end)
 
 
 def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
@@ -95,7 +95,7 @@ def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> P
     stem_key, label_key, blocks_key, head_key = jax.random.split(key, 4)
     weights = {
         "labels": jax.random.normal(label_key, (2, config.labels, config.embedding)),
-        "stem": _dense(stem_key, config.rank + 1 + 2 * config.embedding, config.width),
+        "stem": _dense(stem_key, config.rank + charts.SCALARS + config.pose + 2 * config.embedding, config.width),
         "blocks": _blocks(blocks_key, config),
         "head": _dense(head_key, config.width, 1),
     }
@@ -103,25 +103,24 @@ def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> P
 
 
 @jax.jit
-def _score(params: Params, values: jax.Array, start, end) -> jax.Array:
-    """How real a motion looks, from its coordinates (R + 1,); any real number, larger is more real."""
+def _score(params: Params, values: jax.Array, start, end, pose: jax.Array) -> jax.Array:
+    """How real a motion looks, from its coordinates (2 + R,); any real number, larger is more real."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
-    # Centred per pair, and brought to order one by a single factor: a factor per direction would blow up the
-    # gradient along the narrow ones, which the penalty then fights.
-    offset = (values[1:] - chart.mean[start, end]) / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
-    hidden = jnp.concatenate([values[:1], offset, weights["labels"][0, start], weights["labels"][1, end]])
+    # Centred, and brought to order one by a single factor: a factor per direction would blow up the gradient
+    # along the narrow ones, which the penalty then fights.
+    offset = values - charts.expected(chart, start, end, pose)
+    factor = 1 / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
+    offset = offset.at[charts.SCALARS :].multiply(factor)
+    hidden = jnp.concatenate([offset, weights["labels"][0, start], weights["labels"][1, end], pose])
     return _linear(weights["head"], _residual_stack(weights, hidden, partial(jax.nn.leaky_relu, negative_slope=0.2)))[0]
 
 
 @jax.jit
-def _criticise(params: Params, tangent: jax.Array, log_length: jax.Array, start, end) -> jax.Array:
-    """How real a tangent vector at p (T-1, L, 3) with a log-length () looks for two label indices."""
-    return _score(
-        params,
-        charts.coordinates(jax.lax.stop_gradient(params.chart), tangent, log_length, start, end),
-        start,
-        end,
-    )
+def _criticise(params: Params, tangent: jax.Array, log_length, log_seconds, start, end, pose: jax.Array) -> jax.Array:
+    """How real a tangent vector at p (T-1, L, 3) with a log-length and log-seconds () looks for labels and pose."""
+    chart = jax.lax.stop_gradient(params.chart)
+    values = charts.coordinates(chart, tangent, log_length, log_seconds, start, end)
+    return _score(params, values, start, end, pose)
 
 
 generator = Network(_init_generator, _generate, _generate_coordinates)
@@ -129,11 +128,11 @@ critic = Network(_init_critic, _criticise, _score)
 
 
 @jax.jit
-def sample(params: Params, key: jax.Array, start, end) -> tuple[jax.Array, jax.Array]:
-    """Draw a motion: a point q on the sphere (T-1, L, 3), and its log-length ()."""
+def sample(params: Params, key: jax.Array, start, end, pose: jax.Array) -> Motion:
+    """Draw a motion between two labels that starts at a pose (D,)."""
     noise = jax.random.normal(key, params.weights["skip"].shape[:1])
-    tangent, log_length = generator.apply(params, noise, start, end)
-    return sphere.exp(params.chart.p, tangent), log_length
+    tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
+    return Motion(sphere.exp(params.chart.p, tangent), log_length, log_seconds)
 
 
 def _dense(key: jax.Array, inputs: int, outputs: int) -> Weights:
@@ -162,10 +161,11 @@ def _residual_stack(weights: Weights, x: jax.Array, activation) -> jax.Array:
 
 def _check_chart(chart: Chart, config: Config) -> None:
     expected = (config.rank, config.steps, config.landmarks, 3)
-    if chart.basis.shape != expected or chart.mean.shape != (config.labels, config.labels, config.rank):
+    means = (config.labels, config.labels, config.rank)
+    if chart.basis.shape != expected or chart.mean.shape != means or len(chart.pose_scale) != config.pose:
         raise ValueError(
-            f"the chart's basis must be {expected} for {config.labels} labels; "
-            f"got {chart.basis.shape} and means {chart.mean.shape}"
+            f"the chart's basis must be {expected} for {config.labels} labels and poses of {config.pose}; "
+            f"got {chart.basis.shape}, means {chart.mean.shape} and poses of {len(chart.pose_scale)}"
         )
 
 

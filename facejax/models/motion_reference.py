@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from facejax.geometry import sphere
-from facejax.models.charts import Chart
+from facejax.models.charts import Chart, Motion
 
 Weights = dict[str, Any]
 
@@ -80,7 +80,7 @@ def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, 
     standard = _linear(weights["length"], jnp.mean(image, (0, 1)))[0]
     image = jnp.tanh(_convolve(_tile(image, condition), weights["convs"][-1], stride=1))
     tangent = sphere.project(chart.p, image[..., 0].T.reshape(steps, landmarks, 3))
-    return tangent, chart.length_mean[start, end] + chart.length_std * standard
+    return tangent, chart.scalar_mean[start, end, 0] + chart.scalar_std[0] * standard
 
 
 def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
@@ -106,13 +106,27 @@ def _criticise(params: Params, tangent: jax.Array, log_length: jax.Array, start,
     image = tangent.reshape(len(tangent), -1).T[..., None]
     for kernel in weights["convs"]:
         image = _tile(_leaky(_convolve(image, kernel, stride=2)), condition)
-    standard = (log_length - chart.length_mean[start, end]) / chart.length_std
+    standard = (log_length - chart.scalar_mean[start, end, 0]) / chart.scalar_std[0]
     hidden = _leaky(_linear(weights["hidden"], jnp.append(jnp.ravel(image), standard)))
     return _linear(weights["head"], hidden)[0]
 
 
 generator = Network(_init_generator, _generate)
 critic = Network(_init_critic, _criticise)
+
+
+@jax.jit
+def sample(params: Params, key: jax.Array, start, end, pose: jax.Array | None = None) -> Motion:
+    """Draw a motion between two labels. The pose is not heeded, and the duration is the pair's mean."""
+    del pose
+    noise = jax.random.normal(key, (_noise(params),))
+    tangent, log_length = generator.apply(params, noise, start, end)
+    return Motion(sphere.exp(params.chart.p, tangent), log_length, params.chart.scalar_mean[start, end, 1])
+
+
+def _noise(params: Params) -> int:
+    """The labels enter the first layer twice, as two one-hots each."""
+    return params.weights["stem"]["kernel"].shape[0] - 4 * len(params.chart.scalar_mean)
 
 
 def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:
@@ -122,7 +136,7 @@ def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:
 
 
 def _one_hots(chart: Chart, start, end) -> jax.Array:
-    labels = len(chart.length_mean)
+    labels = len(chart.scalar_mean)
     return jnp.concatenate([jax.nn.one_hot(start, labels), jax.nn.one_hot(end, labels)])
 
 

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from facejax import evaluation, fitting
+from facejax import evaluation, fit_decoder
 from facejax.data import makehuman
 from facejax.data.meshes import of_split
 from facejax.mesh import topology
@@ -37,9 +37,9 @@ def test_meshes_batch_select_and_fold(tiny_store):
 
 def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store, hierarchy, regions, tmp_path):
     train = of_split(tiny_store, "train")
-    plan = fitting.DecoderPlan(steps=60, batch=8, rate=2e-3)
-    whole = fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan)
-    again = fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan)
+    plan = fit_decoder.Plan(steps=60, batch=8, rate=2e-3)
+    whole = fit_decoder.fit(train, hierarchy, tmp_path / "whole", plan=plan)
+    again = fit_decoder.fit(train, hierarchy, tmp_path / "whole", plan=plan)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -48,7 +48,7 @@ def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store
         return found["face"]["mean_mm"]
 
     with pytest.raises(ValueError, match="a run with another plan, seed"):
-        fitting.fit_decoder(train, hierarchy, tmp_path / "whole", plan=plan._replace(steps=50), seed=1)
+        fit_decoder.fit(train, hierarchy, tmp_path / "whole", plan=plan._replace(steps=50), seed=1)
     untrained = decoder.init(jax.random.key(0), hierarchy, scale=whole.scale)
     assert mean(whole) < 0.85 * mean(untrained)
 

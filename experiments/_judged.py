@@ -1,0 +1,164 @@
+"""What experiments on generated motion share: real motions of people that no generator has seen, and scores.
+
+Two groups of people. Generators are chosen on "validation": the 20 validation subjects and 120 people of another
+population (seed 2). What is published is measured on "test": the 20 test subjects and 120 people of a third (seed 3).
+Their transitions are taken before any selection by prototypes, which narrows them: everybody's start meets
+everybody's end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from sklearn.ensemble import RandomForestClassifier
+
+from facejax import augment, composition, fit_motion, metrics, pipeline
+from facejax.data import makehuman4d, motions, performance
+
+GROUPS = {"validation": 2, "test": 3}  # a split of the dataset, and the seed of the population that joins it
+Pair = tuple[int, int]
+Names = tuple[str, str]
+
+
+class Held(NamedTuple):
+    """Real motions of held-out people, in millimetres of a mean face; one entry for each pair of labels."""
+
+    pairs: list[Pair]
+    names: list[Names]
+    curves: list[np.ndarray]  # (M, T, L, 3) each: displacements from neutral
+    reference: list[np.ndarray]  # (T, L, 3) each: the one held-out sample of OT23
+    people: int
+    scale: float  # millimetres per unit of a generated motion
+
+
+def data_of(config: Any):
+    """The dataset that generators are trained on."""
+    return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+
+
+def halves_of(config: Any, group: str) -> motions.Motions:
+    """Every half of a group's people; `config` has level, subjects, meshes and people."""
+    data = data_of(config)
+    parts = [motions.halves(data, group)]
+    if config.people:
+        spec = makehuman4d.Spec(config.level, config.people, config.people, seed=GROUPS[group])
+        others = makehuman4d.prepare(spec)
+        for split in ("train", "validation", "test"):
+            part = motions.halves(others, split)
+            parts.append(part._replace(subject=part.subject + config.subjects))
+    return motions.join(*parts)
+
+
+def held(config: Any, group: str, names: Sequence[Names] = makehuman4d.PAIRS) -> Held:
+    """Unselected transitions of a group's people: as many of each pair as there are people."""
+    labels = performance.LABELS
+    halves = halves_of(config, group)
+    pairs = [(labels.index(a), labels.index(b)) for a, b in names]
+    people = len(np.unique(halves.subject))
+    onsets = halves.take(halves.start == 0)
+    between = motions.interpolated(onsets, len(labels), per_pair=people, choice="spread", only=set(pairs), seed=1)
+    found = motions.join(halves, *between)
+    scale = float(np.mean(found.scale))
+    curves = [scale * of_pair(found, pair) for pair in pairs]
+    # Of the half that stands for "real", so that it is never compared with itself.
+    halves = [np.zeros(len(c) // 2, int) for c in curves]
+    one = [np.argmax(augment.one_of_each(half, half, seed=1)) for half in halves]
+    reference = [c[i] for c, i in zip(curves, one, strict=True)]
+    return Held(pairs, list(names), curves, reference, people, scale)
+
+
+def seen(config: Any, pairs: Sequence[Pair], scale: float, count: int) -> list[np.ndarray]:
+    """`count` training motions of each pair in millimetres, unselected."""
+    data = data_of(config)
+    halves = motions.halves(data, "train")
+    onsets = halves.take(halves.start == 0)
+    between = motions.interpolated(onsets, len(data.labels), per_pair=count, choice="spread", only=set(pairs), seed=2)
+    found = motions.join(halves, *between)
+    return [scale * of_pair(found, pair)[:count] for pair in pairs]
+
+
+def of_pair(found: motions.Motions, pair: Pair) -> np.ndarray:
+    """The curves of one (start, end)."""
+    return found.curves[(found.start == pair[0]) & (found.end == pair[1])]
+
+
+def drawn(models: pipeline.Models, held: Held, *, samples: int, seed: int) -> list[np.ndarray]:
+    """`samples` generated motions of each pair, in millimetres."""
+    keys = jax.random.split(jax.random.key(seed), len(held.pairs))
+    found = []
+    for pair, key in zip(held.pairs, keys, strict=True):
+        curves = composition.draw(models.motion, models.starts, jax.random.split(key, samples), np.array([pair])).curves
+        found.append(held.scale * np.asarray(curves[:, 0]))
+    return found
+
+
+def forest(config: Any, names: Sequence[Names], trees: int = 300) -> RandomForestClassifier:
+    """OT23's classifier: 30 x 204 displacements from neutral, unitless, of training people's transitions -> which pair.
+
+    Its training set is the one of OT23: halves, and transitions selected by prototypes.
+    """
+    data = data_of(config)
+    pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in names]
+    train, which = labelled(fit_motion.transitions(data, "train"), pairs)
+    found = RandomForestClassifier(trees, random_state=config.seed, n_jobs=-1)
+    return found.fit(train.curves.reshape(len(which), -1), which)
+
+
+def labelled(found: motions.Motions, pairs: Sequence[Pair]) -> tuple[motions.Motions, np.ndarray]:
+    """The motions of the given pairs, and which pair each is."""
+    number = {pair: i for i, pair in enumerate(pairs)}
+    which = np.array([number.get(pair, -1) for pair in zip(found.start.tolist(), found.end.tolist(), strict=True)])
+    return found.take(which >= 0), which[which >= 0]
+
+
+def recognised(classifier: RandomForestClassifier, curves: Sequence[np.ndarray], scale: float) -> list[float]:
+    """The share of each pair's curves (in mm) that are named rightly."""
+    shares = []
+    for i, found in enumerate(curves):
+        shares.append(float(np.mean(classifier.predict(found.reshape(len(found), -1) / scale) == i)))
+    return shares
+
+
+def scores(found: Sequence[np.ndarray], real: Held, train: Sequence[np.ndarray]) -> list[dict[str, float]]:
+    """One row of figures for each pair: generated (or real) motions against held-out ones, at equal counts.
+
+    Half of the real motions stand for "real"; the other half, scored in the place of generated ones, is the ceiling:
+    `scores([c[len(c) // 2 :] for c in real.curves], real, train)`.
+    """
+    rows = []
+    for mine, all_real, reference, known in zip(found, real.curves, real.reference, train, strict=True):
+        count = min(len(mine), len(all_real) // 2)
+        mine, truth = mine[:count], all_real[:count]
+        across, own, own_real = (metrics.distances(a, b) for a, b in ((mine, truth), (mine, mine), (truth, truth)))
+        spread = float(metrics.mean_off_diagonal(own_real))
+        rows.append(
+            {
+                "specificity_mm": float(metrics.specificity(mine, reference)),
+                "specificity_all_mm": float(np.mean(across)),
+                "real_all_mm": spread,
+                "davies_mm": float(np.mean(metrics.nearest_distance(mine, known))),
+                "davies_real_mm": float(np.mean(metrics.nearest_distance(truth, known))),
+                "diversity_ratio": float(metrics.mean_off_diagonal(own)) / spread,
+                "acceleration_ratio": float(np.mean(metrics.acceleration(mine)) / np.mean(metrics.acceleration(truth))),
+                "coverage": float(metrics.coverage(across, own_real, neighbours=min(5, count - 1))),
+                "energy": float(metrics.energy_distance(across, own, own_real)),
+            }
+        )
+    return rows
+
+
+def mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """The mean of every figure over pairs, and the range of those whose extremes matter."""
+    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    for name in ("diversity_ratio", "acceleration_ratio"):
+        values = [row[name] for row in rows]
+        means[f"{name}_range"] = [min(values), max(values)]
+    return means
+
+
+def ceiling(real: Held) -> list[np.ndarray]:
+    """The other half of the real motions, to be scored as if generated."""
+    return [curves[len(curves) // 2 :] for curves in real.curves]

@@ -1,0 +1,227 @@
+"""Do transitions in a row stay faces? OT23's Fig. 8, and chains of 20.
+
+Fig. 8: five sequences of three transitions, 64 samples, 90 frames; the error per frame against the one held-out sample
+of each transition, as in `experiments.specificity`. Beyond the paper: chains of 20 random transitions that end at
+neutral. Does the distance to the nearest real motion of the pair (Davies) grow along the chain? Where does the last
+frame end? And at the joints: does position or speed jump? Of held-out people, as in `experiments.specificity`.
+
+    python -m experiments.composed --publish --models runs/generators/flow-{0,1,2}.safetensors
+
+About 4 minutes on 2 cores.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from PIL import Image
+
+from experiments import _judged, _run
+from facejax import composition, files, io, metrics, pipeline
+from facejax.data import performance
+from facejax.io import dress, sheet
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+# The first is named in OT23's text, the third is its yellow curve; the paper does not say what the others were.
+FIVE = (
+    ("neutral", "bareteeth", "eyebrow", "lips_up"),
+    ("neutral", "high_smile", "mouth_open", "cheeks_in"),
+    ("mouth_down", "mouth_side", "mouth_open", "lips_back"),
+    ("bareteeth", "high_smile", "mouth_up", "neutral"),
+    ("cheeks_in", "mouth_extreme", "bareteeth", "lips_up"),
+)
+TRANSITIONS = 20
+FRAMES = 30
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    out: Path = Path("runs/composed")
+    """Folder for the results."""
+    seed: int = 0
+    """Of the chains and of the noise."""
+    models: tuple[Path, ...] = ()
+    """Weights to judge, the mean over them; by default the released ones."""
+    samples: int = 64
+    """Of each sequence."""
+    chains: int = 8
+    """How many different chains of 20 transitions."""
+    level: int = 3
+    """Realism of the dataset."""
+    subjects: int = 120
+    """Of the dataset."""
+    meshes: int = 20_000
+    """Of the dataset."""
+    people: int = 120
+    """Of the population that joins the test subjects; 0: none."""
+    publish: bool = False
+    """Also write the figures that the README quotes."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """Compose, and measure along the way."""
+    begun = time.perf_counter()
+    chains = random_chains(config.chains, config.seed)
+    steps = {pair for labels in (*FIVE, *chains) for pair in zip(labels[:-1], labels[1:], strict=True)}
+    real = _judged.held(config, "test", sorted(steps))
+    of = {name: i for i, name in enumerate(real.names)}
+    rows, errors = [], []
+    paths = config.models or (None,)
+    for path in paths:
+        models = pipeline.load(path)
+        errors.append([_errors(models, config, labels, real, of) for labels in FIVE])
+        rows.append([_chain(models, config, i, labels, real, of) for i, labels in enumerate(chains)])
+    davies = np.array([[row["davies_mm"] for row in each] for each in rows])  # models, chains, samples, transitions
+    own = np.array([row["davies_real_mm"] for row in rows[0]])  # chains, transitions
+    early, late = np.median(davies[..., :5]), np.median(davies[..., 15:20])
+    measured = [row["joints"] for each in rows for row in each]
+    joints = {name: float(np.mean([row[name] for row in measured])) for name in measured[0]}
+    found = {
+        "davies_1_to_5_mm": float(early),
+        "davies_16_to_20_mm": float(late),
+        "davies_ratio": float(late / early),
+        "davies_each_mm": np.median(davies, axis=(0, 1, 2)).tolist(),
+        "davies_real_mm": float(np.mean(own)),
+        "davies_over_real_1_to_5": float(np.median(davies[..., :5] / own[:, None, :5])),
+        "davies_over_real_16_to_20": float(np.median(davies[..., 15:20] / own[:, None, 15:20])),
+        "from_neutral_at_the_end_mm": float(np.max([[row["end_mm"] for row in each] for each in rows])),
+        **joints,
+        "error_per_frame_mm": dict(zip(map(" > ".join, FIVE), np.mean(errors, axis=0).tolist(), strict=True)),
+        "people": real.people,
+    }  # fmt: skip
+    figure = _plot(config.out, found)
+    _picture(config.out, pipeline.load(paths[0]), chains[0], config.seed)
+    data = _judged.data_of(config)
+    made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
+    _run.finish("composed", config, found, made=made, table=_table(found), figure=figure)
+    if config.publish:
+        with files.replacing(_run.RESULTS / "composed_chain.png") as temporary:
+            temporary.write_bytes((config.out / "chain.png").read_bytes())
+    return found
+
+
+def random_chains(count: int, seed: int) -> list[tuple[str, ...]]:
+    """Chains of 21 labels, neutral first and last, in which none follows itself."""
+    random = np.random.default_rng(seed)
+    chains = []
+    for _ in range(count):
+        labels = ["neutral"]
+        while len(labels) < TRANSITIONS:
+            label = str(random.choice(performance.LABELS[1:]))
+            if label != labels[-1]:
+                labels.append(label)
+        chains.append((*labels, "neutral"))
+    return chains
+
+
+def _errors(models: pipeline.Models, config: Config, labels, real: _judged.Held, of: dict) -> np.ndarray:
+    """Mean distance (T,) to the held-out sample of each transition in turn."""
+    key = jax.random.key(config.seed)
+    drawn = real.scale * np.asarray(pipeline.displacements(models, key, labels, samples=config.samples))
+    truth = [real.reference[of[pair]] for pair in zip(labels[:-1], labels[1:], strict=True)]
+    # A joint is both the end of one transition and the start of the next; it counts to the one that ends there.
+    line = np.concatenate([truth[0], *(curve[1:] for curve in truth[1:])])
+    return np.linalg.norm(drawn - line, axis=-1).mean(axis=(0, 2))
+
+
+def _chain(
+    models: pipeline.Models, config: Config, number: int, labels, real: _judged.Held, of: dict
+) -> dict[str, Any]:
+    """One chain: distance of every transition to the nearest real one, the end, and the joints."""
+    pairs = list(zip(labels[:-1], labels[1:], strict=True))
+    key = jax.random.fold_in(jax.random.key(config.seed), number)
+    drawn = real.scale * np.asarray(pipeline.displacements(models, key, labels, samples=config.samples))
+    cut = [drawn[:, i * (FRAMES - 1) : i * (FRAMES - 1) + FRAMES] for i in range(len(pairs))]
+    known = [real.curves[of[pair]] for pair in pairs]
+    nearest = [metrics.nearest_distance(mine, truth) for mine, truth in zip(cut, known, strict=True)]
+    own = [np.asarray(metrics.distances(truth, truth)) for truth in known]
+    return {
+        "davies_mm": np.stack([np.asarray(row) for row in nearest], axis=1).tolist(),
+        "davies_real_mm": [float((table + 1e9 * np.eye(len(table))).min(axis=1).mean()) for table in own],
+        "end_mm": float(np.abs(drawn[:, -1]).max()),
+        "joints": _joints(models, key, labels, drawn, real.scale),
+    }
+
+
+def _joints(models: pipeline.Models, key, labels, drawn: np.ndarray, scale: float) -> dict[str, float]:
+    """Acceleration at the joints over the mean inside transitions; and with no more than positions joined."""
+    at = np.arange(1, len(labels) - 1) * (FRAMES - 1) - 1
+
+    def relative(curves):
+        bend = np.linalg.norm(np.diff(curves, n=2, axis=1), axis=-1).mean(axis=-1)
+        return float(bend[:, at].mean() / np.delete(bend, at, axis=1).mean())
+
+    indices = pipeline.label_indices(models, labels)
+    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(drawn)))
+    curves = scale * np.asarray(composition.draw(models.motion, models.starts, keys, pairs).curves)
+    gaps = np.abs(curves[:, 1:, 0] - curves[:, :-1, -1]).max()
+    plain = np.concatenate([curves[:, 0], *(curves[:, i, 1:] for i in range(1, curves.shape[1]))], axis=1)
+    return {
+        "gap_mm": float(gaps),
+        "joint_acceleration_ratio": relative(drawn),
+        "joint_acceleration_ratio_unmatched": relative(plain),
+    }
+
+
+def _table(found: dict[str, Any]) -> str:
+    rows = [
+        ("distance to the nearest real motion, transitions 1 to 5, median, mm", f"{found['davies_1_to_5_mm']:.3f}", ""),
+        ("the same, transitions 16 to 20", f"{found['davies_16_to_20_mm']:.3f}", ""),
+        ("16 to 20 over 1 to 5", f"{found['davies_ratio']:.3f}", "≤ 1.2"),
+        ("over that of real motions to the nearest other: 1 to 5", f"{found['davies_over_real_1_to_5']:.3f}", ""),
+        ("the same: 16 to 20", f"{found['davies_over_real_16_to_20']:.3f}", ""),
+        ("from neutral at the end, all chains go home, largest, mm", f"{found['from_neutral_at_the_end_mm']:.1e}", ""),
+        ("jump in position at a joint, largest, mm", f"{found['gap_mm']:.1e}", "0"),
+        ("acceleration at joints over that between them", f"{found['joint_acceleration_ratio']:.4f}", "≤ 1"),
+        ("the same without matching speeds", f"{found['joint_acceleration_ratio_unmatched']:.3f}", ""),
+    ]  # fmt: skip
+    return _run.markdown(
+        (f"chains of {TRANSITIONS} transitions, {found['people']} held-out people", "", "wanted"), rows
+    )
+
+
+def _plot(out: Path, found: dict[str, Any]) -> Path:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.2), constrained_layout=True)
+    for labels, curve in found["error_per_frame_mm"].items():
+        left.plot(curve, label=labels.replace("_", " "))
+    for joint in (29, 58):
+        left.axvline(joint, color="0.8", zorder=0)
+    left.set_xlabel("frame")
+    left.set_ylabel("distance to the held-out sample, mm")
+    left.set_ylim(bottom=0)
+    left.legend(frameon=False, fontsize=7)
+    right.bar(np.arange(1, TRANSITIONS + 1), found["davies_each_mm"], color="#5b8db8")
+    right.set_xlabel("transition of the chain")
+    right.set_ylabel("distance to the nearest real motion, mm")
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / "composed.png"
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+    return path
+
+
+def _picture(out: Path, models: pipeline.Models, labels, seed: int) -> None:
+    """The average face at every peak of one chain."""
+    face = models.face
+    marks = pipeline.landmarks(models, jax.random.key(seed), labels, face.vertices)
+    vertices = np.asarray(pipeline.meshes(models, marks[:: FRAMES - 1], face.vertices))
+    parts = dress.parts(models.props, np.asarray(marks[0]), np.asarray(marks[:: FRAMES - 1]))
+    pictures = io.render.frames(vertices, face.faces, size=(160, 200), extras=parts)
+    pictures = sheet.caption(pictures, tuple((i, name.replace("_", " ")) for i, name in enumerate(labels)))
+    rows = [pictures[:7], pictures[7:14], pictures[14:]]
+    with files.replacing(out / "chain.png") as temporary:
+        Image.fromarray(sheet.contact_sheet(rows)).save(temporary, "PNG")
+
+
+if __name__ == "__main__":
+    _run.main("composed", Config, run)

@@ -1,0 +1,130 @@
+"""Transitions in a row: A to B to C, each drawn, started where the last one ended, and joined without a jolt.
+
+The paper (OT23, 4.3) takes the end of one transition as the start of the next and leaves it at that. Three things are
+added. The generator is told the pose that it starts from. What a pose cannot express fades along the path, so that
+errors do not add up over a chain. And steps on both sides of a joint are made equal, so that neither position nor
+speed jumps there.
+
+Displacements from neutral, unitless; S samples, P transitions of T frames each, L landmarks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from facejax.geometry import srvf
+from facejax.models import charts, generators, starts
+
+REACH = 8  # frames on each side of a joint over which its correction fades
+
+
+class Drawn(NamedTuple):
+    """Transitions as they were generated, before they are put on one line of time."""
+
+    curves: jax.Array  # (S, P, T, L, 3); each begins where the one before ends
+    log_seconds: jax.Array  # (S, P)
+
+
+@jax.jit
+def draw(generator: generators.Params, beginnings: starts.Params, keys: jax.Array, pairs: jax.Array) -> Drawn:
+    """Draw transitions between labels `pairs` (P, 2), each from the end of the one before; one sample per key (S,).
+
+    The first starts at a peak of its label, drawn from `beginnings`.
+    """
+    chart = jax.lax.stop_gradient(generator.chart)
+
+    def one(key):
+        first_key, key = jax.random.split(key)
+        first = charts.unpose(chart, _beginning(generator, beginnings, first_key, pairs[0, 0]), pairs[0, 0])
+
+        def transition(here, inputs):
+            key, (start, end) = inputs
+            curve, log_seconds = _transition(generator, chart, key, here, start, end)
+            return curve[-1], (curve, log_seconds)
+
+        _, drawn = jax.lax.scan(transition, first, (jax.random.split(key, len(pairs)), pairs))
+        return Drawn(*drawn)
+
+    return jax.vmap(one)(keys)
+
+
+@jax.jit
+def join(curves: jax.Array, line: jax.Array) -> jax.Array:
+    """Transitions (S, P, T, L, 3) on one line of time (F, P T), from `timeline`: (S, F, L, 3)."""
+    samples, count, frames, *rest = curves.shape
+    if line.shape[1] != count * frames:
+        raise ValueError(f"line: expected (F, {count * frames}) for {count} x {frames} frames, got {line.shape}")
+    return jnp.einsum("ft,stlc->sflc", line, curves.reshape(samples, count * frames, *rest))
+
+
+def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> np.ndarray:
+    """The matrix (F, P T) that puts P transitions of T = `drawn` frames on one line of time.
+
+    Transition i gets `frames[i]` frames, joints are not repeated: F = 1 + sum(frames - 1). Frames between drawn ones
+    lie on cubic curves (Catmull-Rom). The steps on both sides of a joint become equal, and what that changes fades over
+    `reach` frames; first and last frames stay. All of it is linear in the frames, hence one matrix, the same for all
+    samples. Raises `ValueError` for fewer than two frames.
+    """
+    frames = [int(count) for count in frames]
+    if not frames or min(frames) < 2 or drawn < 2:
+        raise ValueError(f"frames: expected 2 or more for each transition, got {frames} of {drawn} drawn")
+    ends = np.cumsum([0] + [count - 1 for count in frames])
+    line = np.zeros((ends[-1] + 1, len(frames) * drawn))
+    for i, count in enumerate(frames):
+        line[ends[i] : ends[i + 1] + 1, :] = 0  # the joint is where both agree: the later one's
+        line[ends[i] : ends[i + 1] + 1, i * drawn : (i + 1) * drawn] = _cubic(count, drawn)
+    for i, joint in enumerate(ends[1:-1]):
+        bend = line[joint + 1] - 2 * line[joint] + line[joint - 1]
+        # The half of a transition that is nearer to the joint, so that two corrections never meet.
+        sides = [(sign, min(reach, (frames[i + (sign > 0)] - 1) // 2)) for sign in (-1, 1)]
+        open_sides = [(sign, width) for sign, width in sides if width]
+        for sign, width in open_sides:
+            for k in range(1, width + 1):
+                fade = k * ((width + 1 - k) / width) ** 2
+                line[joint + sign * k] -= fade / len(open_sides) * bend
+    return line.astype(np.float32)
+
+
+def _beginning(generator, beginnings, key, label):
+    if generators.heeds_pose(generator):
+        return starts.sample(beginnings, key, label)
+    # A motion drawn for nobody in particular starts at the mean peak, as in the paper.
+    return jnp.zeros_like(generator.chart.pose_scale)
+
+
+def _transition(generator, chart, key, here, start, end):
+    pose = charts.pose(chart, here, start)
+    motion = generators.sample(generator, key, start, end, pose)
+    if not generators.heeds_pose(generator):
+        return srvf.decode(motion.q, motion.log_length, here), motion.log_seconds
+    meant = charts.unpose(chart, pose, start)
+    curve = srvf.decode(motion.q, motion.log_length, meant)
+    covered = srvf.covered(motion.q)[:, None, None]
+    # No jump, and no motion where there was none: what separates the two beginnings fades along the path. A way home
+    # ends at neutral exactly, which no network can promise.
+    curve = curve + (1 - covered) * (here - meant)
+    return curve - jnp.where(end == 0, covered * curve[-1], 0), motion.log_seconds
+
+
+def _cubic(count: int, drawn: int) -> np.ndarray:
+    """Catmull-Rom interpolation (count, drawn) at even places; ends by linear extrapolation."""
+    place = np.linspace(0, drawn - 1, count)
+    low = np.minimum(place.astype(int), drawn - 2)
+    x = place - low
+    weights = np.stack([-x + 2 * x**2 - x**3, 2 - 5 * x**2 + 3 * x**3, x + 4 * x**2 - 3 * x**3, x**3 - x**2]) / 2
+    padded = np.zeros((count, drawn + 2))
+    rows = np.arange(count)
+    for k, weight in enumerate(weights):
+        padded[rows, low + k] += weight
+    matrix = padded[:, 1:-1]
+    # A frame before the first is 2 x0 - x1, one after the last likewise.
+    matrix[:, 0] += 2 * padded[:, 0]
+    matrix[:, 1] -= padded[:, 0]
+    matrix[:, -1] += 2 * padded[:, -1]
+    matrix[:, -2] -= padded[:, -1]
+    return matrix

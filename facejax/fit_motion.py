@@ -1,0 +1,337 @@
+"""Training generators of motion: a dataset in, parameters out.
+
+Three of one interface: the GAN sized for a CPU, the GAN as its authors built it, and the flow. All learn from the same
+motions; each run keeps metrics and checkpoints in a folder and goes on from there when called again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from facejax import journal, losses, steps, training
+from facejax.data import motions, store
+from facejax.geometry import sphere, srvf
+from facejax.models import charts, flow, motion, motion_reference, starts
+
+PER_PAIR = 48  # interpolated transitions of each ordered pair: with 12 labels about the 6,740 of OT23
+SPREAD = 400  # of each ordered pair where everybody meets everybody
+CHARTED = 80  # of each, that a chart is fitted on
+
+
+class GanPlan(NamedTuple):
+    """How Motion3DGAN is trained; OT23's figures where it gives them."""
+
+    steps: int = 10_000
+    batch: int = 128
+    critic_steps: int = 4
+    rate: float = 5e-4  # decays along a cosine, to 5 %
+    penalty: float = 10.0
+    reconstruction: float = 0.0  # alpha_2 of OT23 (10 there): it narrows the spread within a label pair
+    length: float = 0.0  # weight of |log-length error|, which goes with it
+    geodesic: float = 0.0  # weight of the geodesic distance, which the authors' program adds (10 there)
+    decay: float = 0.999  # of the generator's moving average
+
+
+# The authors' GAN with OT23's own weights and rate.
+REFERENCE = GanPlan(steps=2_000, rate=1e-4, reconstruction=10.0, length=10.0)
+
+
+class FlowPlan(NamedTuple):
+    """How the flow is trained."""
+
+    steps: int = 20_000
+    batch: int = 256
+    rate: float = 1e-3  # decays along a cosine, to zero
+    weight_decay: float = 1e-4
+    whitening: float = 0.5  # 0: errors count as they are on the sphere; 1: in units of each direction's deviation
+    decay: float = 0.999  # of the moving average
+
+
+class Examples(NamedTuple):
+    """Motions in a chart's coordinates, as the networks see them."""
+
+    values: np.ndarray  # (M, 2 + R)
+    start: np.ndarray  # (M,)
+    end: np.ndarray  # (M,)
+    pose: np.ndarray  # (M, D)
+
+
+def transitions(
+    data: store.Store,
+    split: str,
+    *,
+    names: Sequence[str] | None = None,
+    per_pair: int = PER_PAIR,
+    reuse: int | None = 1,
+    pace: str = "performed",
+) -> motions.Motions:
+    """OT23's set: halves, and the peak -> peak transitions nearest to the prototypes, between every two expressions.
+
+    `names` as in `data.motions.halves`; `per_pair`, `reuse` and `pace` as in `data.motions.interpolated`.
+    """
+    halves = motions.halves(data, split, names=names)
+    onsets = halves.take(halves.start == 0)
+    count = len(data.labels if names is None else names)
+    return motions.join(halves, *motions.interpolated(onsets, count, per_pair=per_pair, reuse=reuse, pace=pace))
+
+
+def everything(
+    data: store.Store,
+    split: str,
+    *,
+    names: Sequence[str] | None = None,
+    per_pair: int | None = SPREAD,
+    pace: str = "performed",
+    seed: int = 0,
+) -> Iterator[motions.Motions]:
+    """Halves, and unselected peak -> peak transitions in which everybody meets everybody, part by part."""
+    halves = motions.halves(data, split, names=names)
+    yield halves
+    onsets = halves.take(halves.start == 0)
+    count = len(data.labels if names is None else names)
+    yield from motions.interpolated(onsets, count, per_pair=per_pair, choice="spread", pace=pace, seed=seed)
+
+
+def chart_of(
+    known: motions.Motions, *, labels: int, rank: int = 128, pose: int = 32, mean: str = "karcher"
+) -> charts.Chart:
+    """The chart of a training set, at the "karcher" mean of its motions, or their normalised "extrinsic" one."""
+    if mean not in ("karcher", "extrinsic"):
+        raise ValueError(f'mean: expected "karcher" or "extrinsic", got {mean!r}')
+    q, log_length = srvf.encode(jnp.asarray(known.curves))
+    p = sphere.karcher_mean(q) if mean == "karcher" else sphere.extrinsic_mean(q)
+    motion = charts.Motion(None, np.asarray(log_length), np.log(known.seconds))
+    return charts.fit(
+        np.asarray(p), np.asarray(sphere.log(p, q)), motion, known.start, known.end, known.curves[:, 0],
+        labels=labels, rank=rank, pose=pose,
+    )  # fmt: skip
+
+
+def examples_of(chart: charts.Chart, parts: Iterable[motions.Motions]) -> Examples:
+    """Motions in a chart's coordinates; parts are forgotten one after the other."""
+    rows = []
+    for part in parts:
+        values, pose = _place(chart, part.curves, np.log(part.seconds), part.start, part.end)
+        rows.append(Examples(np.asarray(values), part.start, part.end, np.asarray(pose)))
+    return Examples(*(np.concatenate(fields) for fields in zip(*rows, strict=True)))
+
+
+def balanced(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Row numbers in which every (start, end) occurs as often as the most frequent one, for training."""
+    pair = np.asarray(start) * (max(start.max(), end.max()) + 1) + np.asarray(end)
+    most = np.bincount(pair).max()
+    random = np.random.default_rng(seed)
+    return np.concatenate([np.resize(random.permutation(np.flatnonzero(pair == one)), most) for one in np.unique(pair)])
+
+
+def fit_starts(chart: charts.Chart, known: motions.Motions) -> starts.Params:
+    """The peaks from which motions start when only a label is known, of the motions that start at one."""
+    peaks = known.take((known.start == 0) & (known.end > 0))
+    poses = jax.vmap(charts.pose, (None, 0, 0))(chart, jnp.asarray(peaks.curves[:, -1]), jnp.asarray(peaks.end))
+    return starts.fit(np.asarray(poses), peaks.end, classes=len(chart.mean))
+
+
+def fit_gan(
+    examples: Examples,
+    chart: charts.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: GanPlan = GanPlan(),
+    config: motion.Config = motion.Config(),
+    seed: int = 0,
+    average: bool = True,
+) -> motion.Params:
+    """Train the generator against its critic; returns its moving average, or with `average` off its last state."""
+    config = _sized(config, chart)
+    _claim(folder, "gan", plan, config, seed, examples.values)
+    generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
+    players = steps.Players(
+        motion.generator.init(generator_key, chart, config=config).weights,
+        motion.critic.init(critic_key, chart, config=config).weights,
+    )
+    optimisers = steps.Players(
+        *(
+            optax.adam(optax.cosine_decay_schedule(plan.rate, plan.steps * count, alpha=0.05), 0.5, 0.9)
+            for count in (1, plan.critic_steps)
+        )
+    )
+    step = steps.adversarial(
+        lambda weights, chart, key, condition: motion.generator.inner(
+            motion.Params(chart, weights), jax.random.normal(key, (config.noise,)), *condition
+        ),
+        lambda weights, chart, values, condition: motion.critic.inner(
+            motion.Params(chart, weights), values, *condition
+        ),
+        optimisers,
+        critic_steps=plan.critic_steps,
+        penalty=plan.penalty,
+        terms=_terms(plan) if plan.reconstruction or plan.length or plan.geodesic else None,
+        decay=plan.decay,
+    )
+    state = steps.start_adversarial(players, optimisers, play_key)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed)
+    return motion.Params(chart, state.extra if average else state.params.generator)
+
+
+def fit_flow(
+    examples: Examples,
+    chart: charts.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: FlowPlan = FlowPlan(),
+    config: flow.Config = flow.Config(),
+    seed: int = 0,
+) -> flow.Params:
+    """Train a velocity field; returns its moving average."""
+    config = _sized(config, chart)
+    _claim(folder, "flow", plan, config, seed, examples.values)
+    init_key, run_key = jax.random.split(jax.random.key(seed))
+    weights = flow.init(init_key, chart, config=config).weights
+
+    def loss(weights, key, batch, chart):
+        values, condition = batch
+        source_key, time_key = jax.random.split(key)
+        keys = jax.random.split(source_key, len(values))
+        source = jax.vmap(flow.source, (None, 0, 0, 0, 0))(chart, keys, *condition)
+        target = jax.vmap(flow.wrap, (None, 0))(chart, values)
+        unit = jax.vmap(flow.unit, (None, 0, 0))(chart, *condition[:2])
+        # Of one size in the mean, whatever the power: the two scalars keep their weight.
+        size = jnp.sqrt(jnp.mean(unit ** (2 - 2 * plan.whitening), axis=1, keepdims=True))
+        unit = size * unit**plan.whitening
+        params = flow.Params(chart, weights)
+
+        def field(state, time, condition):
+            return flow.velocity(params, state, time, *condition)
+
+        return losses.flow_matching(field, time_key, source, target, condition, unit), {}
+
+    optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
+    step = steps.averaged(steps.supervised(loss, optimiser), plan.decay)
+    state = steps.start_supervised(weights, optimiser, run_key)._replace(extra=weights)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed)
+    return flow.Params(chart, state.extra)
+
+
+def fit_reference(
+    known: motions.Motions,
+    chart: charts.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: GanPlan = REFERENCE,
+    config: motion_reference.Config = motion_reference.Config(),
+    seed: int = 0,
+) -> motion_reference.Params:
+    """Train the GAN as its authors built it, on whole tangent vectors; returns the generator's moving average."""
+    _, steps_, landmarks, _ = chart.basis.shape
+    config = config._replace(steps=steps_, landmarks=landmarks, labels=len(chart.mean))
+    q, log_length = srvf.encode(jnp.asarray(known.curves))
+    pair = jnp.asarray(known.start), jnp.asarray(known.end)
+    standard = (log_length - chart.scalar_mean[*pair, 0]) / chart.scalar_std[0]
+    real = {"tangent": sphere.log(chart.p, q), "length": standard}
+    _claim(folder, "reference", plan, config, seed, np.asarray(known.curves))
+    generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
+    players = steps.Players(
+        motion_reference.generator.init(generator_key, chart, config=config).weights,
+        motion_reference.critic.init(critic_key, chart, config=config).weights,
+    )
+    optimisers = steps.Players(optax.adam(plan.rate, 0.5, 0.9), optax.adam(plan.rate, 0.5, 0.9))
+
+    def scalars(chart, pair):
+        return chart.scalar_mean[*pair, 0], chart.scalar_std[0]
+
+    def generate(weights, chart, key, pair):
+        params = motion_reference.Params(chart, weights)
+        tangent, log_length = motion_reference.generator.apply(params, jax.random.normal(key, (config.noise,)), *pair)
+        # The critic sees what log_p makes of exp_p: the same vector, but for angles beyond pi.
+        tangent = sphere.log(chart.p, sphere.exp(chart.p, tangent))
+        mean, deviation = scalars(chart, pair)
+        return {"tangent": tangent, "length": (log_length - mean) / deviation}
+
+    def score(weights, chart, sample, pair):
+        mean, deviation = scalars(chart, pair)
+        params = motion_reference.Params(chart, weights)
+        return motion_reference.critic.apply(params, sample["tangent"], mean + deviation * sample["length"], *pair)
+
+    def terms(chart, fake, real, pair):
+        length = chart.scalar_std[0] * losses.tangent_l1(fake["length"], real["length"])
+        return {
+            "reconstruction": plan.reconstruction * losses.tangent_l1(fake["tangent"], real["tangent"]),
+            "length": plan.length * length,
+        }
+
+    step = steps.adversarial(
+        generate, score, optimisers, critic_steps=plan.critic_steps, penalty=plan.penalty, terms=terms, decay=plan.decay
+    )
+    state = training.run(
+        training.gathered(step),
+        steps.start_adversarial(players, optimisers, play_key),
+        training.epoch_indices(seed, len(known.curves), plan.batch * plan.critic_steps),
+        folder,
+        steps=plan.steps,
+        constants=((real, pair), chart),
+        chunk=10,
+        save_seconds=120.0,
+    )
+    return motion_reference.Params(chart, state.extra)
+
+
+def _run(step, state, examples: Examples, chart, folder, count: int, batch: int, seed: int):
+    rows = balanced(examples.start, examples.end, seed)
+    order = training.epoch_indices(seed, len(rows), batch)
+    conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
+    held = (jnp.asarray(examples.values), conditions), chart
+    return training.run(
+        training.gathered(step),
+        state,
+        lambda first, count: rows[order(first, count)],
+        folder,
+        steps=count,
+        constants=held,
+    )
+
+
+def _sized(config, chart: charts.Chart):
+    (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
+    return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
+
+
+def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> None:
+    digest = hashlib.sha256(np.ascontiguousarray(known)).hexdigest()
+    record = {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest, "kind": kind}
+    journal.claim(folder, record)
+
+
+@jax.jit
+def _place(chart, curves, log_seconds, start, end):
+    q, log_length = srvf.encode(curves)
+    values = jax.vmap(charts.coordinates, (None, 0, 0, 0, 0, 0))(
+        chart, sphere.log(chart.p, q), log_length, log_seconds, start, end
+    )
+    return values, jax.vmap(charts.pose, (None, 0, 0))(chart, curves[:, 0], start)
+
+
+def _terms(plan: GanPlan):
+    def terms(chart, fake, real, condition):
+        # Equation 6 on tangent vectors; the coordinates expand linearly, so their difference does.
+        difference = jnp.tensordot((fake - real)[:, charts.SCALARS :], chart.basis, 1)
+        scalars = chart.scalar_std * jnp.mean(jnp.abs((fake - real)[:, : charts.SCALARS]), axis=0)
+        return {
+            "reconstruction": plan.reconstruction * jnp.mean(jnp.abs(difference)),
+            "length": plan.length * jnp.sum(scalars),
+            "geodesic": plan.geodesic * jnp.mean(_distances(chart, fake, real)),
+        }
+
+    return terms
+
+
+def _distances(chart: charts.Chart, fake: jax.Array, real: jax.Array) -> jax.Array:
+    fake, real = (jax.vmap(flow.wrap, (None, 0))(chart, values)[0] for values in (fake, real))
+    return sphere.distance(fake, real)
