@@ -17,6 +17,8 @@ from sklearn.ensemble import RandomForestClassifier
 
 from facejax import augment, composition, fit_motion, metrics, pipeline
 from facejax.data import makehuman4d, motions, performance
+from facejax.geometry import sphere
+from facejax.models import generators, starts
 
 GROUPS = {"validation": 2, "test": 3}  # a split of the dataset, and the seed of the population that joins it
 Pair = tuple[int, int]
@@ -29,6 +31,7 @@ class Held(NamedTuple):
     pairs: list[Pair]
     names: list[Names]
     curves: list[np.ndarray]  # (M, T, L, 3) each: displacements from neutral
+    seconds: list[np.ndarray]  # (M,) each
     reference: list[np.ndarray]  # (T, L, 3) each: the one held-out sample of OT23
     people: int
     scale: float  # millimetres per unit of a generated motion
@@ -63,11 +66,12 @@ def held(config: Any, group: str, names: Sequence[Names] = makehuman4d.PAIRS) ->
     found = motions.join(halves, *between)
     scale = float(np.mean(found.scale))
     curves = [scale * of_pair(found, pair) for pair in pairs]
+    seconds = [found.seconds[(found.start == a) & (found.end == b)] for a, b in pairs]
     # Of the half that stands for "real", so that it is never compared with itself.
     halves = [np.zeros(len(c) // 2, int) for c in curves]
     one = [np.argmax(augment.one_of_each(half, half, seed=1)) for half in halves]
     reference = [c[i] for c, i in zip(curves, one, strict=True)]
-    return Held(pairs, list(names), curves, reference, people, scale)
+    return Held(pairs, list(names), curves, seconds, reference, people, scale)
 
 
 def seen(config: Any, pairs: Sequence[Pair], scale: float, count: int) -> list[np.ndarray]:
@@ -90,9 +94,35 @@ def drawn(models: pipeline.Models, held: Held, *, samples: int, seed: int) -> li
     keys = jax.random.split(jax.random.key(seed), len(held.pairs))
     found = []
     for pair, key in zip(held.pairs, keys, strict=True):
-        curves = composition.draw(models.motion, models.starts, jax.random.split(key, samples), np.array([pair])).curves
-        found.append(held.scale * np.asarray(curves[:, 0]))
+        curves = composition.compose(models.motion, models.starts, key, pair, samples=samples)
+        found.append(held.scale * np.asarray(curves))
     return found
+
+
+def seconds(models: pipeline.Models, held: Held, *, samples: int, seed: int) -> list[np.ndarray]:
+    """How long the motions of `drawn` take."""
+    found = []
+    for pair, key in zip(held.pairs, jax.random.split(jax.random.key(seed), len(held.pairs)), strict=True):
+        keys, pairs = composition.keys_of(key, samples), composition.pairs_of(pair)
+        found.append(np.exp(np.asarray(composition.draw(models.motion, models.starts, keys, pairs).log_seconds[:, 0])))
+    return found
+
+
+def norm_error(models: pipeline.Models, pairs: Sequence[Pair], *, samples: int, seed: int) -> float:
+    """How far the norms of generated points on the sphere are from 1, at most, over `samples` of each pair."""
+    worst = 0.0
+    for pair, key in zip(pairs, jax.random.split(jax.random.key(seed), len(pairs)), strict=True):
+        worst = max(worst, float(_norm_error(models.motion, models.starts, jax.random.split(key, samples), *pair)))
+    return worst
+
+
+@jax.jit
+def _norm_error(generator, beginnings, keys, start, end):
+    def norm(key):
+        pose_key, key = jax.random.split(key)
+        return sphere.norm(generators.sample(generator, key, start, end, starts.sample(beginnings, pose_key, start)).q)
+
+    return jax.numpy.max(jax.numpy.abs(jax.vmap(norm)(keys) - 1))
 
 
 def forest(config: Any, names: Sequence[Names], trees: int = 300) -> RandomForestClassifier:

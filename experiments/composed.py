@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from PIL import Image
@@ -160,9 +159,8 @@ def _joints(models: pipeline.Models, key, labels, drawn: np.ndarray, scale: floa
         bend = np.linalg.norm(np.diff(curves, n=2, axis=1), axis=-1).mean(axis=-1)
         return float(bend[:, at].mean() / np.delete(bend, at, axis=1).mean())
 
-    indices = pipeline.label_indices(models, labels)
-    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1))
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(drawn)))
+    pairs = composition.pairs_of(pipeline.label_indices(models, labels))
+    keys = composition.keys_of(key, len(drawn))
     curves = scale * np.asarray(composition.draw(models.motion, models.starts, keys, pairs).curves)
     gaps = np.abs(curves[:, 1:, 0] - curves[:, :-1, -1]).max()
     plain = np.concatenate([curves[:, 0], *(curves[:, i, 1:] for i in range(1, curves.shape[1]))], axis=1)

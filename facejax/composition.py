@@ -30,6 +30,43 @@ class Drawn(NamedTuple):
     log_seconds: jax.Array  # (S, P)
 
 
+def compose(
+    generator: generators.Params,
+    beginnings: starts.Params,
+    key: jax.Array,
+    labels: Sequence[int],
+    *,
+    samples: int = 1,
+    frames: Sequence[int] | None = None,
+) -> jax.Array:
+    """Motions through label numbers A, B, C, ...: (S, F, L, 3), `frames` of each transition (by default as drawn).
+
+    Sample i is the same whatever the number of samples. Raises `ValueError` for fewer than two labels, a label that
+    follows itself, no samples, or frames that do not fit.
+    """
+    drawn = draw(generator, beginnings, keys_of(key, samples), pairs_of(labels))
+    count, length = drawn.curves.shape[1:3]
+    line = timeline([length] * count if frames is None else frames, drawn=length)
+    return join(drawn.curves, jnp.asarray(line))
+
+
+def pairs_of(labels: Sequence[int]) -> jax.Array:
+    """The transitions (P, 2) through label numbers. Raises `ValueError` for a label that follows itself."""
+    labels = np.asarray(labels)
+    if labels.ndim != 1 or len(labels) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {labels.tolist()}")
+    if (same := np.flatnonzero(labels[1:] == labels[:-1])).size:
+        raise ValueError(f"labels: number {same[0] + 2} repeats the one before; a transition needs two labels")
+    return jnp.asarray(np.stack([labels[:-1], labels[1:]], axis=1), jnp.int32)
+
+
+def keys_of(key: jax.Array, samples: int) -> jax.Array:
+    """One key for each sample (S,), of which the first ones do not depend on S."""
+    if samples < 1:
+        raise ValueError(f"samples must be 1 or more, got {samples}")
+    return jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(samples))
+
+
 @jax.jit
 def draw(generator: generators.Params, beginnings: starts.Params, keys: jax.Array, pairs: jax.Array) -> Drawn:
     """Draw transitions between labels `pairs` (P, 2), each from the end of the one before; one sample per key (S,).
@@ -44,7 +81,7 @@ def draw(generator: generators.Params, beginnings: starts.Params, keys: jax.Arra
 
         def transition(here, inputs):
             key, (start, end) = inputs
-            curve, log_seconds = _transition(generator, chart, key, here, start, end)
+            curve, log_seconds = _transition(generator, beginnings, chart, key, here, start, end)
             return curve[-1], (curve, log_seconds)
 
         _, drawn = jax.lax.scan(transition, first, (jax.random.split(key, len(pairs)), pairs))
@@ -97,8 +134,8 @@ def _beginning(generator, beginnings, key, label):
     return jnp.zeros_like(generator.chart.pose_scale)
 
 
-def _transition(generator, chart, key, here, start, end):
-    pose = charts.pose(chart, here, start)
+def _transition(generator, beginnings, chart, key, here, start, end):
+    pose = starts.plausible(beginnings, charts.pose(chart, here, start), start)
     motion = generators.sample(generator, key, start, end, pose)
     if not generators.heeds_pose(generator):
         return srvf.decode(motion.q, motion.log_length, here), motion.log_seconds

@@ -29,7 +29,7 @@ CHARTED = 80  # of each, that a chart is fitted on
 class GanPlan(NamedTuple):
     """How Motion3DGAN is trained; OT23's figures where it gives them."""
 
-    steps: int = 10_000
+    steps: int = 8_000
     batch: int = 128
     critic_steps: int = 4
     rate: float = 5e-4  # decays along a cosine, to 5 %
@@ -47,7 +47,7 @@ REFERENCE = GanPlan(steps=2_000, rate=1e-4, reconstruction=10.0, length=10.0)
 class FlowPlan(NamedTuple):
     """How the flow is trained."""
 
-    steps: int = 20_000
+    steps: int = 12_000
     batch: int = 256
     rate: float = 1e-3  # decays along a cosine, to zero
     weight_decay: float = 1e-4

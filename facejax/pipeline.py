@@ -110,9 +110,9 @@ def displacements(
     models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int | Sequence[int] = FRAMES
 ) -> jax.Array:
     """Displacements from neutral (S, T, L, 3) through `labels`, unitless: divided by the face's landmark norm."""
-    drawn = _draw(models, key, labels, samples)
-    line = composition.timeline(lengths(labels, frames), drawn=drawn.curves.shape[2])
-    return composition.join(drawn.curves, jnp.asarray(line))
+    numbers = _numbers(models, labels)
+    each = lengths(labels, frames)
+    return composition.compose(models.motion, models.starts, key, numbers, samples=samples, frames=each)
 
 
 def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: float = RATE) -> tuple[int, ...]:
@@ -122,7 +122,9 @@ def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: fl
     """
     if not rate > 0:
         raise ValueError(f"rate must be above 0 frames per second, got {rate}")
-    seconds = np.exp(np.asarray(_draw(models, key, labels, 1).log_seconds[0]))
+    pairs = composition.pairs_of(_numbers(models, labels))
+    drawn = composition.draw(models.motion, models.starts, composition.keys_of(key, 1), pairs)
+    seconds = np.exp(np.asarray(drawn.log_seconds[0]))
     return tuple(max(2, 1 + round(float(x) * rate)) for x in seconds)
 
 
@@ -170,19 +172,13 @@ def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
     return np.array([models.labels.index(name) for name in labels], np.int32)
 
 
-def _draw(models: Models, key: jax.Array, labels: Sequence[str], samples: int) -> composition.Drawn:
-    indices = label_indices(models, labels)
-    if len(indices) < 2:
-        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+def _numbers(models: Models, labels: Sequence[str]) -> np.ndarray:
     for before, after in zip(labels[:-1], labels[1:], strict=True):
         if before == after:
             raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")
-    if samples < 1:
-        raise ValueError(f"samples must be 1 or more, got {samples}")
-    pairs = jnp.asarray(np.stack([indices[:-1], indices[1:]], axis=1), jnp.int32)
-    # Sample i is the same whatever the number of samples.
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(samples))
-    return composition.draw(models.motion, models.starts, keys, pairs)
+    if len(labels) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
+    return label_indices(models, labels)
 
 
 @jax.jit

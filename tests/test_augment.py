@@ -240,3 +240,49 @@ def test_the_path_is_a_geodesic_of_motions():
     q1, l1, q2, l2, s1, s2 = arguments(motions, 0, 1)
     halfway = srvf.decode(sphere.geodesic(q1, q2, 0.5), (l1 + l2) / 2, (s1 + s2) / 2)[-1]
     np.testing.assert_allclose(augment.transition(q1, l1, q2, l2, s1, s2, frames=3)[1], halfway, atol=1e-6)
+
+
+def test_tau_walks_the_geodesic_and_the_performed_pace_is_the_share_covered():
+    motions = encoded(onsets(6, 4))
+    args = arguments(motions, 0, 1)
+    even = augment.transition(*args, frames=9)
+    np.testing.assert_allclose(augment.transition(*args, jnp.linspace(0, 1, 9), frames=9), even, atol=1e-6)
+    back = augment.transition(*args, jnp.linspace(1, 0, 9), frames=9)
+    np.testing.assert_allclose(back, even[::-1], atol=1e-6)
+    pairs = np.array([[0, 1], [2, 3], [1, 0]])
+    (found,) = augment.transitions(motions, pairs, frames=7, pace="performed")
+    for (i, j), one in zip(pairs, found, strict=True):
+        steps = np.linalg.norm(np.asarray(motions.q[j]).reshape(6, -1), axis=1) ** 2
+        share = np.concatenate([[0], np.cumsum(steps) / steps.sum()])
+        wanted = augment.transition(*arguments(motions, i, j), jnp.asarray(share), frames=7)
+        np.testing.assert_allclose(one, wanted, atol=1e-5)
+    with pytest.raises(ValueError, match="pace: expected one of"):
+        augment.transitions(motions, pairs, pace="slow")
+    with pytest.raises(ValueError, match=r"tau: expected \(..., 9\)"):
+        augment.transition(*args, jnp.zeros(5), frames=9)
+
+
+@pytest.mark.parametrize("sizes", [(4, 4, 4), (4, 6, 3)], ids=str)
+@pytest.mark.parametrize("per_pair", [1, 4, 12, None], ids=str)
+def test_spread_lets_everybody_serve_equally_often(sizes, per_pair):
+    labels = np.random.default_rng(0).permutation(np.repeat(np.arange(3), sizes))
+    pairs = augment.spread(labels, classes=3, per_pair=per_pair)
+    assert len({tuple(pair) for pair in pairs.tolist()}) == len(pairs)
+    for a, b in ((a, b) for a in range(3) for b in range(3) if a != b):
+        mine = pairs[(labels[pairs[:, 0]] == a) & (labels[pairs[:, 1]] == b)]
+        total = sizes[a] * sizes[b]
+        assert len(mine) == (total if per_pair is None else min(per_pair, total))
+        for column, label in ((0, a), (1, b)):
+            served = np.bincount(mine[:, column], minlength=len(labels))[labels == label]
+            assert served.max() - served.min() <= 1
+    with pytest.raises(ValueError, match="per_pair: expected at least 1"):
+        augment.spread(labels, classes=3, per_pair=0)
+
+
+def test_one_of_each_is_held_out():
+    start, end = np.array([0, 0, 1, 1, 1, 2]), np.array([1, 1, 0, 2, 0, 1])
+    mask = augment.one_of_each(start, end)
+    assert sorted(zip(start[mask].tolist(), end[mask].tolist(), strict=True)) == [(0, 1), (1, 0), (1, 2), (2, 1)]
+    assert len({augment.one_of_each(start, end, seed=seed).tobytes() for seed in range(20)}) > 1
+    with pytest.raises(ValueError, match="start, end: expected two"):
+        augment.one_of_each(start, end[:3])

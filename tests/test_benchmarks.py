@@ -2,9 +2,14 @@
 
 import json
 
+import jax
+import jax.numpy as jnp
 import pytest
 
-from benchmarks import _measure, lstm
+from benchmarks import _measure, _transitions, lstm, motion
+from facejax import fit_motion, training
+from facejax.models import flow
+from facejax.models import motion as gan
 
 
 def test_lstm(tmp_path, monkeypatch, capsys):
@@ -49,3 +54,82 @@ def test_lstm_counts_the_products():
     config = lstm.Config(frames=3, hidden=40)
     entries = 4 * 40 * (6 + 40) + 2 * 4 * 40 * 80 + 40 * 6
     assert lstm._products(config, 6, 2) == pytest.approx(2e-9 * entries * 3 * 2)
+
+
+TINY = motion.Config(
+    quick=True,
+    gan=gan.Config(steps=5, landmarks=4, labels=3, noise=6, rank=8, pose=3, width=8, blocks=1, embedding=2),
+    flow=flow.Config(width=8, blocks=1, embedding=2),
+    gan_plan=fit_motion.GanPlan(steps=20, batch=6, critic_steps=2),
+    flow_plan=fit_motion.FlowPlan(steps=20, batch=6),
+    reference_batch=1,
+    width_divisor=16,
+    motions=60,
+    samples=2,
+    people=8,
+    compared=12,
+    transitions=300,
+)
+
+
+handed = motion.handed
+
+
+def idle(fit, *args, **options):
+    """What a fit hands over, but for its step: to compile those takes most of the time."""
+    if fit is fit_motion.fit_reference:  # whose networks are large at any size
+        state = training.TrainState(jnp.int32(0), (), (), jax.random.key(0))
+        run = motion.Run(None, state, jnp.arange(2), ())
+    else:
+        run = handed(fit, *args, **options)
+    return run._replace(step=lambda state, rows, held: (state, {}))
+
+
+@pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_motion(tmp_path, monkeypatch, capsys, whole):
+    monkeypatch.setattr(motion, "torch", None)
+    monkeypatch.setattr(motion, "SCAN", 2)
+    monkeypatch.setattr(motion, "handed", handed if whole else idle)
+    monkeypatch.setattr(motion, "_apart", lambda options: _transitions.stream(**options))
+    _measure.report(motion.run(TINY), tmp_path / "motion.json")
+    rows = json.loads((tmp_path / "motion.json").read_text())["rows"]
+    sides = [(row["task"], row["side"]) for row in rows if "per_s" in row]
+    assert sides == [
+        ("GAN step", "facejax"),
+        ("GAN step", "facejax, scanned"),
+        ("flow step", "facejax"),
+        ("flow step", "facejax, scanned"),
+        ("reference step", "facejax, width / 16"),
+        ("2 motions", "GAN"),
+        ("2 motions", "flow"),
+        ("12 transitions", "facejax"),
+        ("12 transitions", "decoded in full"),
+        ("12 transitions", "NumPy"),
+        ("20 transitions", "facejax, even, streamed"),
+        ("20 transitions", "facejax, performed, streamed"),
+    ]
+    assert all(row["per_s"] > 0 and row["first_s"] > 0 for row in rows if "per_s" in row)
+    assert all(row["memory_mb"] > 0 for row in rows if row["task"].endswith("step"))
+    weights = {row["side"]: row["weights"] for row in rows if row["task"] == "weights"}
+    # Labels, stem with its bias, one block, head, skip.
+    assert weights["GAN, generator"] == 2 * 3 * 2 + 14 * 8 + 9 * 8 + 9 * 10 + 6 * 10
+    assert "[bench]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "fit"), [("Gan", fit_motion.fit_gan), ("Flow", fit_motion.fit_flow)])
+def test_motion_peer_takes_the_same_steps(name, fit):
+    pytest.importorskip("torch")
+    from benchmarks import _motion_torch
+
+    sizes = {field: getattr(TINY.gan, field) for field in ("labels", "steps", "landmarks")}
+    known = _transitions.made_up(TINY.motions, **sizes)
+    chart = fit_motion.chart_of(known, labels=3, rank=8, pose=3)
+    kind = name.lower()
+    plan, config = getattr(TINY, f"{kind}_plan"), getattr(TINY, kind)
+    run = motion.handed(fit, fit_motion.examples_of(chart, [known]), chart, plan=plan, config=config)
+    program, _ = motion.compiled(run)
+    peer = getattr(_motion_torch, name)
+    _motion_torch.check(peer(run.state, run.held, plan), program, run.state, run.rows, run.held)
+    with pytest.raises(AssertionError):
+        wrong = peer(run.state, run.held, plan._replace(rate=2 * plan.rate))
+        _motion_torch.check(wrong, program, run.state, run.rows, run.held)

@@ -2,21 +2,25 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from experiments import (
+    _interpolated,
     classification,
     composed,
     dataset_card,
     expression_lstm,
     generators,
+    interpolation,
     motion_quality,
     pretrain,
     rbf_warp,
     specificity,
     unseen_subjects,
 )
-from facejax import evaluation, expressions, fit_motion
+from facejax import augment, evaluation, expressions, fit_motion
+from facejax.data import makehuman4d, motions
 
 TINY = {"subjects": 6, "meshes": 260}
 
@@ -151,6 +155,33 @@ def test_composed(own_cache, tmp_path):
     assert metrics["joint_acceleration_ratio"] < 0.01 < metrics["joint_acceleration_ratio_unmatched"]
     assert [len(curve) for curve in metrics["error_per_frame_mm"].values()] == [88] * 5
     assert {p.name for p in (tmp_path / "o").glob("*.png")} == {"composed.png", "chain.png"}
+
+
+def test_interpolation(own_cache, tmp_path):
+    config = interpolation.Config(out=tmp_path / "o", level=0, per_expression=2, people=1, trees=10, **TINY)
+    interpolation.run(config)
+    metrics = check(tmp_path / "o", "onsets", "peaks", "recognition", "transitions")
+    rows = metrics["onsets"]["two expressions"]
+    assert rows["sphere"]["length_ratio"] == pytest.approx(1, abs=1e-4) and rows["linear"]["length_ratio"] < 1
+    ways = metrics["peaks"]["ways"]
+    assert ways["linear, even"]["detour"] == pytest.approx(1, abs=1e-4)
+    assert ways["linear, even"]["acceleration_ratio"] < 1e-3
+    assert ways["sphere, performed"]["speed_rms"] < ways["sphere, even"]["speed_rms"]
+    assert set(metrics["recognition"]) == set(ways) and metrics["transitions"] == 66
+    assert {p.name for p in (tmp_path / "o").glob("*.png")} == {"interpolation.png", "sheet.png"}
+
+
+def test_walks_are_those_of_the_library_and_takes_those_of_the_dataset(own_cache):
+    data = makehuman4d.prepare(makehuman4d.Spec(0, **TINY))
+    halves = _interpolated.joined(data, ("train",))
+    onsets = _interpolated.onsets_of(halves)
+    for pace in ("even", "performed"):
+        (theirs,) = motions.interpolated(onsets, len(data.labels), per_pair=1, choice="spread", pace=pace)
+        pairs = augment.spread(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
+        mine = _interpolated.walk(*(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace)
+        np.testing.assert_allclose(mine.curves, theirs.curves, atol=1e-6)
+    direct = motions.directs(data, "test").take(np.arange(3))
+    np.testing.assert_allclose(_interpolated.again(data, direct, take=0).curves, direct.curves, atol=1e-6)
 
 
 @pytest.mark.slow

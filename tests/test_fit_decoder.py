@@ -8,7 +8,7 @@ from facejax import evaluation, fit_decoder
 from facejax.data import makehuman
 from facejax.data.meshes import of_split
 from facejax.mesh import topology
-from facejax.models import decoder, linear, motion
+from facejax.models import decoder, linear
 
 
 @pytest.fixture(scope="module")
@@ -51,17 +51,6 @@ def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store
         fit_decoder.fit(train, hierarchy, tmp_path / "whole", plan=plan._replace(steps=50), seed=1)
     untrained = decoder.init(jax.random.key(0), hierarchy, scale=whole.scale)
     assert mean(whole) < 0.85 * mean(untrained)
-
-
-def test_generator_trains_on_the_data(tiny_store, tmp_path):
-    examples = fitting.transitions(tiny_store, "train", per_pair=2)
-    assert len(examples.curves) == 4 * 18 * 2 + 18 * 17 * 2
-    config = motion.Config(rank=16, width=32, blocks=1, noise=16, embedding=4)
-    plan = fitting.MotionPlan(steps=4, batch=16, critic_steps=2, reconstruction=1.0, length=0.1)
-    params = fitting.fit_motion(examples, tmp_path, labels=19, plan=plan, config=config)
-    q, log_length = motion.sample(params, jax.random.key(0), 0, 4)
-    assert q.shape == (29, 68, 3) and np.isfinite(q).all() and np.isfinite(log_length)
-    assert (tmp_path / "metrics.jsonl").read_text().count("reconstruction") == 1
 
 
 def test_vertex_errors_are_those_of_the_plain_loop(tiny_store, regions):

@@ -171,3 +171,30 @@ def test_eager_jit_vmap_and_gradients_agree(x64, function, shapes):
 def test_wrong_input_is_named(call, match):
     with pytest.raises(ValueError, match=match):
         call()
+
+
+def test_sets_of_motions_against_plain_loops():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(5, 4, 3, 3)), rng.normal(size=(7, 4, 3, 3))
+    table = np.array([[np.linalg.norm(x - y, axis=-1).mean() for y in b] for x in a])
+    across, own, real = (metrics.distances(x, y) for x, y in ((a, b), (a, a), (b, b)))
+    np.testing.assert_allclose(across, table, rtol=1e-5)
+    pairs = [np.linalg.norm(x - y, axis=-1).mean() for i, x in enumerate(a) for j, y in enumerate(a) if i != j]
+    assert float(metrics.mean_off_diagonal(own)) == pytest.approx(np.mean(pairs), rel=1e-5)
+    others = np.array([[np.linalg.norm(x - y, axis=-1).mean() for y in b] for x in b])
+    near = [table[:, j].min() < np.sort(others[j])[2] for j in range(7)]
+    assert float(metrics.coverage(across, real, neighbours=2)) == pytest.approx(np.mean(near))
+    spread = (others.sum() - np.trace(others)) / 42
+    wanted = (2 * table.mean() - np.mean(pairs) - spread) / spread
+    assert float(metrics.energy_distance(across, own, real)) == pytest.approx(wanted, rel=1e-4, abs=1e-5)
+
+
+def test_energy_distance_is_zero_for_one_distribution_and_grows_with_a_shift():
+    rng = np.random.default_rng(1)
+
+    def energy(shift):
+        a, b = rng.normal(size=(40, 3, 2, 3)), rng.normal(size=(40, 3, 2, 3)) + shift
+        return float(metrics.energy_distance(metrics.distances(a, b), metrics.distances(a, a), metrics.distances(b, b)))
+
+    assert abs(np.mean([energy(0) for _ in range(8)])) < 0.01
+    assert 0.03 < energy(0.5) < energy(1.0)

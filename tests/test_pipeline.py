@@ -95,6 +95,30 @@ def test_a_long_chain_neither_drifts_nor_jumps(models, person):
 
 def test_captions_follow_the_joints():
     assert pipeline.captions(["a", "b", "c"], frames=30) == ((0, "a → b"), (29, "b → c"))
+    assert pipeline.captions(["a", "b", "c"], frames=(10, 7)) == ((0, "a → b"), (9, "b → c"))
+
+
+def test_natural_durations_belong_to_the_motion(models, person):
+    labels = ["neutral", "surprise", "mouth_side", "neutral"]
+    frames = pipeline.durations(models, KEY, labels)
+    # People take 0.3 to 0.75 s to a peak or home, at 30 frames per second.
+    assert len(frames) == 3 and all(7 <= count <= 30 for count in frames)
+    twice = pipeline.durations(models, KEY, labels, rate=60)
+    assert all(abs((a - 1) - 2 * (b - 1)) <= 1 for a, b in zip(twice, frames, strict=True))
+    moved = pipeline.landmarks(models, KEY, labels, person.vertices, frames=frames)
+    assert len(moved) == 1 + sum(count - 1 for count in frames)
+    evenly = np.asarray(pipeline.landmarks(models, KEY, labels, person.vertices))
+    peaks = np.cumsum([0] + [count - 1 for count in frames])
+    np.testing.assert_allclose(np.asarray(moved)[peaks], evenly[::29], atol=1e-3)
+    with pytest.raises(ValueError, match="rate must be above 0"):
+        pipeline.durations(models, KEY, labels, rate=0)
+
+
+def test_samples_do_not_depend_on_how_many_are_drawn(models, person):
+    few, many = (
+        np.asarray(pipeline.landmarks(models, KEY, ["anger", "fear"], person.vertices, samples=n)) for n in (2, 4)
+    )
+    np.testing.assert_allclose(few, many[:2], atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -105,6 +129,8 @@ def test_captions_follow_the_joints():
         (["neutral"], {}, "a start and an end"),
         (["neutral", "anger", "anger"], {}, "'anger' follows itself"),
         (["neutral", "anger"], {"frames": 1}, "2 or more"),
+        (["neutral", "anger"], {"frames": (30, 30)}, "one number, or 1 for 1 transitions, got 2"),
+        (["neutral", "anger"], {"frames": 12.5}, "whole numbers of 2 or more, got 12.5"),
         (["neutral", "anger"], {"samples": 0}, "1 or more"),
         (["neutral", "anger"], {"intensity": 2.5}, r"0\.\.2, got 2.5"),
     ],
@@ -132,7 +158,7 @@ def test_saved_models_load_the_same(models, person, tmp_path):
 
 def test_files_that_hold_no_models_are_named(tmp_path):
     path = tmp_path / "other.safetensors"
-    weights.save(path, {"a": np.zeros(3, np.float32)}, metadata={"shapes": {"a": ["float32", [3]]}})
+    weights.save(path, {"a": np.zeros(3, np.float32)}, metadata={"shapes": {"a": ["float32", [3]]}, "generator": "gan"})
     with pytest.raises(weights.WeightsError, match="does not describe facejax models"):
         pipeline.load(path)
     with pytest.raises(weights.WeightsError, match="no weights file"):

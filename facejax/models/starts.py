@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+LIMIT = 2.5  # deviations from the mean beyond which no face of a label is taken to stand
 BLUR = 0.4  # deviation of the blur, in units of the label's own deviation
 
 
@@ -46,6 +47,21 @@ def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> Params:
         values, vectors = np.linalg.eigh(np.cov(own.T, bias=True))
         roots[label] = vectors * np.sqrt(np.maximum(values, 0))
     return Params(*(jnp.asarray(x, jnp.float32) for x in (table, counts, roots)))
+
+
+@jax.jit
+def plausible(params: Params, pose: jax.Array, label) -> jax.Array:
+    """The pose (D,) brought to within `LIMIT` deviations along each principal axis of the label's peaks.
+
+    A chain of transitions ends each one a little beside a real peak. What lies along axes that the label's peaks do not
+    use at all would be carried on, and a network asked about faces that it has never seen.
+    """
+    root, count = params.root[label], params.count[label]
+    mean = jnp.sum(params.poses[label], axis=0) / count
+    variance = jnp.sum(root**2, axis=0)
+    used = variance > 1e-6 * jnp.max(variance)
+    along = jnp.where(used, (pose - mean) @ root / jnp.where(used, variance, 1), 0)
+    return mean + root @ jnp.clip(along, -LIMIT, LIMIT)
 
 
 @jax.jit
