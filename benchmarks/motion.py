@@ -17,7 +17,8 @@ medians to its first row. `memory_mb` of a step is what its compiled program hol
 
 The peer is eager: with torch.compile the critic fails that check, since its penalty wants a second derivative, and the
 flow gains a twentieth at most. On a machine that is busy with other work PyTorch's threads wait for one another: see
-its row of one thread. It comes with the extra `bench`; without it its rows are left out. About MINUTES.
+its row of one thread. It comes with the extra `bench`; without it its rows are left out. About five minutes on a busy machine, --quick two to four;
+--whole five more.
 """
 
 from __future__ import annotations

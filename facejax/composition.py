@@ -104,8 +104,9 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
 
     Transition i gets `frames[i]` frames, joints are not repeated: F = 1 + sum(frames - 1). Frames between drawn ones
     lie on cubic curves (Catmull-Rom). The steps on both sides of a joint become equal, and what that changes fades over
-    `reach` frames; first and last frames stay. All of it is linear in the frames, hence one matrix, the same for all
-    samples. Raises `ValueError` for fewer than two frames.
+    `reach` frames; first and last frames stay, and so does a joint's bend where two frames leave no room beside it. All
+    of it is linear in the frames, hence one matrix, the same for all samples. Raises `ValueError` for fewer than two
+    frames.
     """
     frames = [int(count) for count in frames]
     if not frames or min(frames) < 2 or drawn < 2:
@@ -115,10 +116,12 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
     for i, count in enumerate(frames):
         line[ends[i] : ends[i + 1] + 1, :] = 0  # the joint is where both agree: the later one's
         line[ends[i] : ends[i + 1] + 1, i * drawn : (i + 1) * drawn] = _cubic(count, drawn)
-    for i, joint in enumerate(ends[1:-1]):
+    for i, joint in reversed(list(enumerate(ends[1:-1]))):
         bend = line[joint + 1] - 2 * line[joint] + line[joint - 1]
-        # The half of a transition that is nearer to the joint, so that two corrections never meet.
-        sides = [(sign, min(reach, (frames[i + (sign > 0)] - 1) // 2)) for sign in (-1, 1)]
+        # The half of a transition that is nearer to the joint, so that two corrections never meet: a middle frame
+        # belongs to the joint that follows, which has had its turn.
+        halves = (frames[i] - 1) // 2, (frames[i + 1] - (1 if joint == ends[-2] else 2)) // 2
+        sides = [(sign, min(reach, half)) for sign, half in zip((-1, 1), halves, strict=True)]
         open_sides = [(sign, width) for sign, width in sides if width]
         for sign, width in open_sides:
             for k in range(1, width + 1):

@@ -98,8 +98,8 @@ def interpolated(
         peaks = onsets.curves[:, -1]
         prototypes = np.zeros((labels, *peaks.shape[1:]))
         prototypes[1:] = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
-        everything = len(onsets.curves) ** 2
-        chosen = augment.select(peaks, onsets.end, prototypes, per_pair=per_pair or everything, reuse=reuse).pairs
+        count = len(onsets.curves) ** 2 if per_pair is None else per_pair
+        chosen = augment.select(peaks, onsets.end, prototypes, per_pair=count, reuse=reuse).pairs
     if only is not None:
         wanted = np.zeros((labels, labels), bool)
         wanted[tuple(np.array(sorted(only), int).reshape(-1, 2).T)] = True

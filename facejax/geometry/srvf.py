@@ -90,8 +90,10 @@ def covered(q: jax.Array) -> jax.Array:
     _check(q, "q", "T-1", 1)
     speed = jnp.sum(q**2, axis=(-2, -1))
     total = jnp.sum(speed, axis=-1, keepdims=True)
-    share = jnp.cumsum(speed, axis=-1) / jnp.where(total > 0, total, 1)
-    return jnp.concatenate([jnp.zeros_like(share[..., :1]), share], axis=-1)
+    moving = total > 0
+    share = jnp.cumsum(speed[..., :-1], axis=-1) / jnp.where(moving, total, 1)
+    # The last is not left to rounding.
+    return jnp.concatenate([jnp.zeros_like(total), share, jnp.where(moving, jnp.ones_like(total), 0)], axis=-1)
 
 
 @jax.jit
