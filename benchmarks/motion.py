@@ -15,10 +15,9 @@
 Motions are made up; the sizes are a training's. Rows of a task are timed in turns, and `over_first` is the ratio of
 medians to its first row. `memory_mb` of a step is what its compiled program holds at once, data included.
 
-The peer is eager: with torch.compile the critic fails that check, since its penalty wants a second derivative, and the
-flow gains a twentieth at most. On a machine that is busy with other work PyTorch's threads wait for one another: see
-its row of one thread. It comes with the extra `bench`; without it its rows are left out. About five minutes on a busy machine, --quick two to four;
---whole five more.
+The peer is eager: under torch.compile the critic fails that check, and the flow gains a twentieth at most. On a machine
+that is busy with other work PyTorch's threads wait for one another: see its row of one thread. It comes with the extra
+`bench`; without it its rows are left out. About four minutes, --quick two; a busy machine takes twice that.
 """
 
 from __future__ import annotations

@@ -86,6 +86,7 @@ def idle(fit, *args, **options):
 
 
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow  # compiles the whole game twice
 def test_motion(tmp_path, monkeypatch, capsys, whole):
     monkeypatch.setattr(motion, "torch", None)
     monkeypatch.setattr(motion, "SCAN", 2)
