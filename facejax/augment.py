@@ -244,7 +244,8 @@ def _chunk(motions: Motions, pairs: jax.Array, *, frames: int, pace: str) -> jax
     tau = None
     if pace == "performed":
         share = srvf.covered(second.q)
-        tau = align.resample(share[..., None, None], frames=frames)[..., 0, 0] if share.shape[-1] != frames else share
+        place = jnp.linspace(0, share.shape[-1] - 1, frames)
+        tau = jax.vmap(lambda one: jnp.interp(place, jnp.arange(len(one)), one))(share)
     ends = first.q, first.log_length, second.q, second.log_length, first.start, second.start
     return transition(*ends, tau, frames=frames)
 

@@ -262,6 +262,14 @@ def test_tau_walks_the_geodesic_and_the_performed_pace_is_the_share_covered():
         augment.transition(*args, jnp.zeros(5), frames=9)
 
 
+def test_another_number_of_frames_takes_the_performed_pace_between_its_frames():
+    motions = encoded(onsets(6, 2))
+    (found,) = augment.transitions(motions, np.array([[0, 1]]), frames=10, pace="performed")
+    share = np.interp(np.linspace(0, 6, 10), np.arange(7), srvf.covered(motions.q[1]))
+    wanted = augment.transition(*arguments(motions, 0, 1), jnp.asarray(share, jnp.float32), frames=10)
+    np.testing.assert_allclose(found[0], wanted, atol=1e-5)
+
+
 @pytest.mark.parametrize("sizes", [(4, 4, 4), (4, 6, 3)], ids=str)
 @pytest.mark.parametrize("per_pair", [1, 4, 12, None], ids=str)
 def test_spread_lets_everybody_serve_equally_often(sizes, per_pair):

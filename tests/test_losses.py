@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from facejax import losses
+from facejax.geometry import sphere
 
 RNG = np.random.default_rng(0)
 PREDICTED, TARGET = RNG.standard_normal((2, 2, 5, 7, 3)).astype(np.float32)
@@ -154,6 +155,71 @@ def test_penalty_gradient_equals_finite_differences():
         return losses.critic(score, jax.random.key(1), REAL, FAKE, CONDITION)[0]
 
     check_grads(lambda w: loss(jnp.asarray(w)), (jnp.asarray(DIRECTION),), 1, modes=["rev"], eps=1e-2, rtol=2e-2)
+
+
+# Flow matching: five numbers on the sphere, two beside them, three samples.
+
+LABEL, UNIT, KEY = np.array([0, 2, 1]), RNG.uniform(0.2, 2, (3, 5)).astype(np.float32), jax.random.key(4)
+FIELD = {"v": RNG.standard_normal((3, 5, 5)).astype(np.float32), "s": RNG.standard_normal((3, 2)).astype(np.float32)}
+
+
+def states(seed):
+    y, s = np.random.default_rng(seed).normal(size=(3, 7)).astype(np.float32)[:, :5], RNG.standard_normal((3, 2))
+    return (y / np.linalg.norm(y, axis=1, keepdims=True))[:, None, None], s.astype(np.float32)
+
+
+SOURCE, END = states(5), states(6)
+
+
+def bilinear(weights):
+    def field(state, time, label):
+        y, s = state
+        v = jnp.asarray(weights["v"])[label] @ y[0, 0] + time
+        return sphere.project(y, v[None, None]), time * s + jnp.asarray(weights["s"])[label]
+
+    return field
+
+
+def loop_flow_matching(weights):
+    rows, times = [], np.asarray(jax.random.uniform(KEY, (3,)), np.float64)
+    for i, t in enumerate(times):
+        (a, s0), (b, s1) = ((np.float64(y[i, 0, 0]), np.float64(s[i])) for y, s in (SOURCE, END))
+        angle = np.arccos(a @ b)
+        y = (np.sin((1 - t) * angle) * a + np.sin(t * angle) * b) / np.sin(angle)
+        way = angle * (np.cos(t * angle) * b - np.cos((1 - t) * angle) * a) / np.sin(angle)
+        v = weights["v"][LABEL[i]] @ y + t
+        off = (v - (v @ y) * y - way) / UNIT[i]
+        rate = t * ((1 - t) * s0 + t * s1) + weights["s"][LABEL[i]]
+        rows.append(np.concatenate([off, rate - (s1 - s0)]) ** 2)
+    return np.mean(rows)
+
+
+def test_flow_matching_is_the_plain_loop_with_gradients():
+    def loss(weights):
+        return losses.flow_matching(bilinear(weights), KEY, SOURCE, END, LABEL, UNIT)
+
+    np.testing.assert_allclose(jax.jit(loss)(FIELD), loop_flow_matching(FIELD), rtol=1e-4)
+    check_grads(jax.jit(loss), (jax.tree.map(jnp.asarray, FIELD),), 1, modes=["rev"], eps=1e-2, rtol=1e-2)
+
+
+def test_flow_matching_is_zero_for_what_is_left_of_the_way_and_counts_in_units():
+    ends = END[0], END[1]
+
+    def exact(state, time, i):
+        (y, s), (y1, s1) = state, jax.tree.map(lambda x: jnp.asarray(x)[i], ends)
+        return sphere.log(y, y1) / (1 - time), (s1 - s) / (1 - time)
+
+    def off(state, time, i):
+        v, rate = exact(state, time, i)
+        return v + 0.1 * sphere.project(state[0], jnp.ones_like(v)), rate
+
+    @jax.jit
+    def cost(unit):
+        return [losses.flow_matching(field, KEY, SOURCE, END, np.arange(3), unit) for field in (exact, off)]
+
+    none, one = cost(UNIT)
+    assert float(none) < 1e-9 < 1e-5 < float(one)
+    np.testing.assert_allclose(cost(2 * UNIT)[1], one / 4, rtol=1e-3)
 
 
 # Steps of expression networks.

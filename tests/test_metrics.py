@@ -166,6 +166,12 @@ def test_eager_jit_vmap_and_gradients_agree(x64, function, shapes):
         (lambda: metrics.peak_displacement(jnp.ones((6, 4, 3)), jnp.ones((5, 3))), "neutral: expected"),
         (lambda: metrics.nearest_distance(jnp.ones((2, 6, 4, 3)), jnp.ones((2, 5, 4, 3))), r"\(M, T, L, 3\)"),
         (lambda: metrics.nearest_distance(*2 * [jnp.ones((2, 6, 4, 3))], chunk=0), "at least 1, got 0 and 2"),
+        (lambda: metrics.distances(jnp.ones((2, 6, 4, 3)), jnp.ones((2, 5, 4, 3))), r"got \(2, 6, 4, 3\) and"),
+        (lambda: metrics.distances(jnp.ones((6, 4, 3)), jnp.ones((6, 4, 3))), r"\(\.\.\., K, T, L, 3\)"),
+        (lambda: metrics.mean_off_diagonal(jnp.ones((3, 2))), r"\(K, K\) with K >= 2, got \(3, 2\)"),
+        (lambda: metrics.mean_off_diagonal(jnp.ones((1, 1))), "K >= 2"),
+        (lambda: metrics.coverage(jnp.ones((2, 5)), jnp.ones((5, 5))), "with M > 5, got"),
+        (lambda: metrics.coverage(jnp.ones((2, 4)), jnp.ones((5, 5)), neighbours=2), r"got \(2, 4\) and \(5, 5\)"),
     ],
 )
 def test_wrong_input_is_named(call, match):
@@ -187,6 +193,21 @@ def test_sets_of_motions_against_plain_loops():
     spread = (others.sum() - np.trace(others)) / 42
     wanted = (2 * table.mean() - np.mean(pairs) - spread) / spread
     assert float(metrics.energy_distance(across, own, real)) == pytest.approx(wanted, rel=1e-4, abs=1e-5)
+
+
+def test_laws_of_distances_and_coverage(x64):
+    a, b = random(30, 6, 4, 3, 3), random(31, 9, 4, 3, 3)
+    table = metrics.distances(a, b)
+    np.testing.assert_allclose(metrics.distances(b, a), table.T, rtol=1e-13)
+    np.testing.assert_allclose(metrics.distances(3 * a + 1, 3 * b + 1), 3 * table, rtol=1e-13)
+    np.testing.assert_allclose(metrics.mean_off_diagonal(metrics.distances(a, a)), metrics.diversity(a), rtol=1e-13)
+    np.testing.assert_allclose(table.min(axis=1), metrics.nearest_distance(a, b), rtol=1e-13)
+    # Real motions cover themselves; motions far away cover none; what is drawn in one place covers its surroundings.
+    real = metrics.distances(b, b)
+    assert float(metrics.coverage(real, real, neighbours=1)) == 1
+    assert float(metrics.coverage(metrics.distances(a + 100, b), real, neighbours=1)) == 0
+    collapsed = float(metrics.coverage(metrics.distances(b[:1], b), real, neighbours=3))
+    assert 1 / 9 <= collapsed < 1
 
 
 def test_energy_distance_is_zero_for_one_distribution_and_grows_with_a_shift():

@@ -6,6 +6,8 @@ import pytest
 
 from facejax import pipeline, weights
 from facejax.data import makehuman, performance
+from facejax.models import generators, motion, motion_reference
+from tests.models.test_motion import plain_weights
 
 
 @pytest.fixture(scope="module")
@@ -154,6 +156,26 @@ def test_saved_models_load_the_same(models, person, tmp_path):
     for a, b in zip(jax.tree.leaves(models[1:7]), jax.tree.leaves(again[1:7]), strict=True):
         np.testing.assert_array_equal(a, b)
     assert path.stat().st_size < 25e6
+
+
+def test_a_file_keeps_its_kind_of_generator(models, tmp_path):
+    chart = models.motion.chart
+    narrow = motion_reference.Config(width_divisor=64, noise=4)
+    with plain_weights():
+        others = {
+            "gan": motion.generator.init(KEY, chart, config=motion.Config(width=16, noise=8)),
+            "reference": motion_reference.generator.init(KEY, chart, config=narrow),
+        }
+    for kind, generator in others.items():
+        path = tmp_path / f"{kind}.safetensors"
+        pipeline.save(path, models._replace(motion=generator))
+        again = pipeline.load(path)
+        assert generators.kind(again.motion) == again.about["generator"] == kind
+        assert jax.tree.structure(again.motion) == jax.tree.structure(generator)
+        for a, b in zip(jax.tree.leaves(again.motion), jax.tree.leaves(generator), strict=True):
+            np.testing.assert_array_equal(a, b)
+    moved = np.asarray(pipeline.displacements(again, KEY, ["neutral", "anger"], samples=1, frames=4))
+    assert moved.shape == (1, 4, 68, 3) and np.isfinite(moved).all()
 
 
 def test_files_that_hold_no_models_are_named(tmp_path):

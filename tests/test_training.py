@@ -209,6 +209,20 @@ def test_gathered_steps_take_indices(tmp_path):
     assert same(state, fit(tmp_path / "plain", 8))
 
 
+def test_the_average_follows_the_parameters_and_changes_nothing_else():
+    plain, state = steps.supervised(loss, OPTIMISER), start()
+    step, other = steps.averaged(plain, 0.9), state._replace(extra=state.params)
+    average = np.asarray(state.params["w"], np.float64)
+    for i in range(5):
+        batch = batches(i, 1)[0]
+        state, metrics = jax.jit(plain)(state, batch, 0.5)
+        other, same_metrics = jax.jit(step)(other, batch, 0.5)
+        average = 0.9 * average + 0.1 * np.asarray(state.params["w"])
+        np.testing.assert_allclose(other.extra["w"], average, rtol=1e-6)
+        assert same(state, other._replace(extra=())) and metrics.keys() == same_metrics.keys()
+    assert np.abs(average - state.params["w"]).max() > 1e-3
+
+
 def adversarial(optimiser, critic_steps):
     def generate(weights, constants, key, condition):
         return weights["g"][condition] + constants * jax.random.normal(key, (2,))

@@ -70,7 +70,7 @@ def test_halves_run_between_neutral_and_peak(tiny_store):
 def test_interpolated_transitions_join_the_peaks(tiny_store):
     halves = motions.halves(tiny_store, "train")
     onsets = halves.take(halves.start == 0)
-    found = motions.interpolated(onsets, 19, per_pair=3, reuse=1)
+    found = motions.join(*motions.interpolated(onsets, 19, per_pair=3, reuse=1))
     assert len(found.curves) == 18 * 17 * 3
     first = found.take((found.start == 1) & (found.end == 2))
     ends = onsets.curves[onsets.end == 2][:, -1]

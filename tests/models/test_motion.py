@@ -1,5 +1,7 @@
 """The motion GAN: exactly tangent output, unit motions, labels that matter, a toy distribution learned."""
 
+from contextlib import contextmanager
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,6 +44,22 @@ def toy(count: int = 240, seed: int = 0):
 
 def fitted(data, **options):
     return charts.fit(*data, pose=CONFIG.pose, **options)
+
+
+@contextmanager
+def plain_weights():
+    """Initial weights are drawn by NumPy: JAX compiles a program for every shape that it draws."""
+
+    def he_normal():
+        def draw(key, shape):
+            rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+            return jnp.asarray(rng.standard_normal(shape) * np.sqrt(2 / np.prod(shape[:-1])), jnp.float32)
+
+        return draw
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.nn.initializers, "he_normal", he_normal)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -282,14 +300,9 @@ def test_reference_sizes_are_the_published_ones():
 
 def test_reference_networks_run_narrow_with_tangent_output(chart):
     config = motion_reference.Config(steps=5, landmarks=4, labels=3, noise=6, width_divisor=16)
-    rng = np.random.default_rng(0)
-
-    def made(network):  # plain random weights of the right shapes spare the compilation of every initialiser
-        shapes = jax.eval_shape(lambda key: network.init(key, chart, config=config), jax.random.key(0)).weights
-        fill = lambda leaf: 0.2 * rng.standard_normal(leaf.shape).astype(np.float32)  # noqa: E731
-        return motion_reference.Params(chart, jax.tree.map(fill, shapes))
-
-    generator, critic = made(motion_reference.generator), made(motion_reference.critic)
+    with plain_weights():
+        generator = motion_reference.generator.init(jax.random.key(0), chart, config=config)
+        critic = motion_reference.critic.init(jax.random.key(1), chart, config=config)
     noise = jax.random.normal(jax.random.key(2), (4, 6))
     tangent, length = jax.vmap(motion_reference.generator.apply, (None, 0, None, None))(generator, noise, 0, 1)
     assert tangent.shape == (4, *SHAPE) and length.shape == (4,)
