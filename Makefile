@@ -33,7 +33,7 @@ slow: setup
 	$(BIN)/python -m pytest -n 2 -m slow
 
 browser: setup
-	$(BIN)/python -m pytest -m browser tests/io
+	$(BIN)/python -m pytest -m browser tests/io tests/test_user_study.py
 
 lint: setup
 	$(BIN)/ruff check .

@@ -36,6 +36,11 @@ class Peer:
         for weight in jax.tree.leaves(self.weights):
             weight.requires_grad_()
 
+    def held(self) -> list[torch.Tensor]:
+        """All that lasts from step to step; slopes do not, a step makes them anew."""
+        moments = [moment for adam in self.adams for state in adam.state.values() for moment in state.values()]
+        return [*self.data, *jax.tree.leaves((tuple(self.chart), self.average, self.weights)), *moments]
+
     def expected(self, start, end, pose):
         """`charts.expected` of a batch."""
         mean = F.pad(self.chart.mean[start, end], (charts.SCALARS, 0))
@@ -118,7 +123,8 @@ class Flow(Peer):
 
     def __init__(self, state: training.TrainState, held: Any, plan: FlowPlan):
         super().__init__(state, held, plan)
-        self.adam = torch.optim.AdamW(jax.tree.leaves(self.weights), weight_decay=plan.weight_decay, fused=True)
+        weights = jax.tree.leaves(self.weights)
+        self.adams = [torch.optim.AdamW(weights, weight_decay=plan.weight_decay, fused=True)]
 
     def draws(self, state: training.TrainState, size: int) -> list[jax.Array]:
         """What our step draws from its key."""
@@ -147,7 +153,7 @@ class Flow(Peer):
         found, found_rate = self._velocity(y, s, time, _told(self.weights, start, end, pose), centre, unit)
         off = (found - wanted) / (size * unit.pow(self.plan.whitening))
         loss = torch.cat([off, found_rate - rate], 1).square().mean()
-        _descend(self.adam, loss, self.plan.rate * _cosine(self.done, self.plan.steps))
+        _descend(self.adams[0], loss, self.plan.rate * _cosine(self.done, self.plan.steps))
         self.follow(self.weights)
         return {"loss": loss.detach()}
 
@@ -212,6 +218,7 @@ def _descend(optimiser: torch.optim.Optimizer, loss: torch.Tensor, rate: float) 
         weight.grad = slope
     group["lr"] = rate
     optimiser.step()
+    optimiser.zero_grad()
 
 
 def _told(weights: Tensors, start, end, pose) -> list[torch.Tensor]:

@@ -6,18 +6,19 @@
   `scanned` is the step within one call of ten, as the loop has it; `minutes` is what all steps of the plan take.
   PyTorch starts from the same weights; first, three steps on the same draws must give the same metrics and weights.
 * `reference step`: the authors' GAN at an eighth of its width, in batches of 8 samples, since a step of 128 takes
-  sixteen times as long: read `per_s`, samples a second. --whole: at full width as well.
+  sixteen times as long and more: read `per_s`, samples a second. --whole: at full width as well.
 * `64 motions`: of one pair of labels. `weights`: how many numbers a network trains.
 * `1,280 transitions` between 1,440 onsets, at the "performed" pace: ours, the plain way, which decodes every point of
   the geodesics in full, and our way in NumPy; all must agree. `streamed`: many more (--quick: fewer), in a process of
   its own, whose peak of memory is `before_mb` when the data are there and `memory_mb` in the end.
 
 Motions are made up; the sizes are a training's. Rows of a task are timed in turns, and `over_first` is the ratio of
-medians to its first row. `memory_mb` of a step is what its compiled program holds at once, data included.
+medians to its first row. `memory_mb` of a step is what its compiled program holds at once, of PyTorch what its
+allocator gave out at one moment of a step; data, weights and the optimiser's moments included.
 
 The peer is eager: under torch.compile the critic fails that check, and the flow gains a twentieth at most. On a machine
 that is busy with other work PyTorch's threads wait for one another: see its row of one thread. It comes with the extra
-`bench`; without it its rows are left out. About four minutes, --quick two; a busy machine takes twice that.
+`bench`; without it its rows are left out. Under two minutes, --quick one; a busy machine takes twice that.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ from facejax.models import charts, flow, generators, motion, motion_reference
 try:
     import torch
 
-    from benchmarks import _motion_torch
+    from benchmarks import _motion_torch, _torch_memory
 except ImportError:
     torch = None
 
@@ -151,10 +152,10 @@ def _steps(
         if config.threads > 1:
             functions["torch, 1 thread"] = lambda: _alone(theirs.step, chosen)
     rows = _rows(task, functions, 5 if config.quick else 11)
-    for row in rows:
-        row["minutes"] = plan.steps * row["median_ms"] / 60e3
-        row |= {"facejax": cost, "facejax, scanned": costs}.get(row["side"], {})
-    return rows
+    found = {"facejax": cost, "facejax, scanned": costs}
+    if torch is not None:
+        found["torch"] = {"memory_mb": _torch_memory.peak_mb(functions["torch"], theirs.held())}
+    return [row | {"minutes": plan.steps * row["median_ms"] / 60e3} | found.get(row["side"], {}) for row in rows]
 
 
 def _onward(program: Callable, run: Run) -> Callable:
