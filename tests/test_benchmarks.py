@@ -86,7 +86,6 @@ def idle(fit, *args, **options):
 
 
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.slow  # compiles the whole game twice
 def test_motion(tmp_path, monkeypatch, capsys, whole):
     monkeypatch.setattr(motion, "torch", None)
     monkeypatch.setattr(motion, "SCAN", 2)
@@ -134,3 +133,19 @@ def test_motion_peer_takes_the_same_steps(name, fit):
     with pytest.raises(AssertionError):
         wrong = peer(run.state, run.held, plan._replace(rate=2 * plan.rate))
         _motion_torch.check(wrong, program, run.state, run.rows, run.held)
+
+
+def test_memory_of_torch_is_what_a_call_holds_at_once():
+    torch = pytest.importorskip("torch")
+    from benchmarks import _torch_memory
+
+    a = torch.ones(1000, 250)  # one megabyte
+
+    def two():
+        b = a + 1
+        c = b + 1
+        del b
+        return c + 1
+
+    assert _torch_memory.peak_mb(two, [a, a.T]) == pytest.approx(3.0, rel=1e-3)
+    assert _torch_memory.peak_mb(lambda: a + 1, [a]) == pytest.approx(2.0, rel=1e-3)
