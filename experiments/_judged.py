@@ -8,8 +8,10 @@ everybody's end.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -37,13 +39,41 @@ class Held(NamedTuple):
     scale: float  # millimetres per unit of a generated motion
 
 
-def data_of(config: Any):
+@dataclasses.dataclass(frozen=True)
+class People:
+    """Options of an experiment on these groups."""
+
+    level: int = 3
+    """Realism of the dataset."""
+    subjects: int = 120
+    """Of the dataset."""
+    meshes: int = 20_000
+    """Of the dataset."""
+    people: int = 120
+    """Of the population that joins the validation or the test subjects; 0: none."""
+    publish: bool = False
+    """Also write the figures that the README quotes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(People):
+    """Options of an experiment that judges trained models on the test group."""
+
+    seed: int = 0
+    """Of everything that is drawn."""
+    models: tuple[Path, ...] = ()
+    """Weights to judge, the mean over them; by default the released ones."""
+    samples: int = 64
+    """Generated motions of each pair; of chains, each sequence."""
+
+
+def data_of(config: People):
     """The dataset that generators are trained on."""
     return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
 
 
-def halves_of(config: Any, group: str) -> motions.Motions:
-    """Every half of a group's people; `config` has level, subjects, meshes and people."""
+def halves_of(config: People, group: str) -> motions.Motions:
+    """Every half of a group's people."""
     data = data_of(config)
     parts = [motions.halves(data, group)]
     if config.people:
@@ -55,7 +85,7 @@ def halves_of(config: Any, group: str) -> motions.Motions:
     return motions.join(*parts)
 
 
-def held(config: Any, group: str, names: Sequence[Names] = makehuman4d.PAIRS) -> Held:
+def held(config: People, group: str, names: Sequence[Names] = makehuman4d.PAIRS) -> Held:
     """Unselected transitions of a group's people: as many of each pair as there are people."""
     labels = performance.LABELS
     halves = halves_of(config, group)
@@ -74,7 +104,7 @@ def held(config: Any, group: str, names: Sequence[Names] = makehuman4d.PAIRS) ->
     return Held(pairs, list(names), curves, seconds, reference, people, scale)
 
 
-def seen(config: Any, pairs: Sequence[Pair], scale: float, count: int) -> list[np.ndarray]:
+def seen(config: People, pairs: Sequence[Pair], scale: float, count: int) -> list[np.ndarray]:
     """`count` training motions of each pair in millimetres, unselected."""
     data = data_of(config)
     halves = motions.halves(data, "train")
@@ -125,7 +155,7 @@ def _norm_error(generator, beginnings, keys, start, end):
     return jax.numpy.max(jax.numpy.abs(jax.vmap(norm)(keys) - 1))
 
 
-def forest(config: Any, names: Sequence[Names], trees: int = 300) -> RandomForestClassifier:
+def forest(config: People, names: Sequence[Names], trees: int = 300) -> RandomForestClassifier:
     """OT23's classifier: 30 x 204 displacements from neutral, unitless, of training people's transitions -> which pair.
 
     Its training set is the one of OT23: halves, and transitions selected by prototypes.

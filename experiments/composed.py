@@ -43,27 +43,11 @@ FRAMES = 30
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_judged.Options):
     out: Path = Path("runs/composed")
     """Folder for the results."""
-    seed: int = 0
-    """Of the chains and of the noise."""
-    models: tuple[Path, ...] = ()
-    """Weights to judge, the mean over them; by default the released ones."""
-    samples: int = 64
-    """Of each sequence."""
     chains: int = 8
     """How many different chains of 20 transitions."""
-    level: int = 3
-    """Realism of the dataset."""
-    subjects: int = 120
-    """Of the dataset."""
-    meshes: int = 20_000
-    """Of the dataset."""
-    people: int = 120
-    """Of the population that joins the test subjects; 0: none."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:

@@ -46,7 +46,7 @@ BOUNDS = {"accuracy": 0.03, "specificity": 1.1, "diversity": (0.8, 1.2), "accele
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_judged.People):
     out: Path = Path("runs/generators")
     """Folder for checkpoints, weights and results."""
     seed: int = 0
@@ -59,18 +59,10 @@ class Config:
     """Of the flow."""
     gan_steps: int = fit_motion.GanPlan().steps
     """Of the GAN."""
-    reference_steps: int = 300
-    """Of the authors' GAN, whose steps cost a hundred times as much."""
-    level: int = 3
-    """Realism of the dataset."""
-    subjects: int = 120
-    """Of the dataset."""
-    meshes: int = 20_000
-    """Of the dataset."""
-    people: int = 120
-    """Of the populations that join the validation and the test subjects."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
+    reference_steps: int = 1000
+    """Of the authors' GAN, of which a sample costs as much as a batch of the others."""
+    reference_batch: int = 16
+    """Its samples in a step."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -163,7 +155,7 @@ def _train(config: Config, name: str, seed: int, data, examples, path: Path) -> 
         plan = fit_motion.GanPlan(steps=config.gan_steps, **terms)
         generator = fit_motion.fit_gan(found, chart, folder, plan=plan, seed=seed, average=average)
     else:
-        plan = fit_motion.REFERENCE._replace(steps=config.reference_steps)
+        plan = fit_motion.REFERENCE._replace(steps=config.reference_steps, batch=config.reference_batch)
         eighth = motion_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
     beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train"))

@@ -37,25 +37,9 @@ TRAINED = 240  # training motions of each pair among which the nearest is sought
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_judged.Options):
     out: Path = Path("runs/specificity")
     """Folder for the results."""
-    seed: int = 0
-    """Of the generator's noise."""
-    models: tuple[Path, ...] = ()
-    """Weights to judge, the mean over them; by default the released ones."""
-    samples: int = 64
-    """Generated transitions of each pair."""
-    level: int = 3
-    """Realism of the dataset."""
-    subjects: int = 120
-    """Of the dataset."""
-    meshes: int = 20_000
-    """Of the dataset."""
-    people: int = 120
-    """Of the population that joins the test subjects; 0: none."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
