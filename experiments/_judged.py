@@ -67,6 +67,11 @@ class Options(People):
     """Generated motions of each pair; of chains, each sequence."""
 
 
+def models_of(config: Options) -> list[pipeline.Models]:
+    """The models to judge. Loaded before anything else is done, so that a wrong name is told at once."""
+    return [pipeline.load(path) for path in config.models or (None,)]
+
+
 def data_of(config: People):
     """The dataset that generators are trained on."""
     return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))

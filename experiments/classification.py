@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from experiments import _judged, _run
-from facejax import fit_motion, pipeline
+from facejax import fit_motion
 from facejax.data import makehuman4d, motions, performance
 
 # OT23's Table 5, in per cent; on CoMA, with another forest and other data.
@@ -42,14 +42,14 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Train the forest, generate, judge."""
     begun = time.perf_counter()
+    judged = _judged.models_of(config)
     data = _judged.data_of(config)
     names = makehuman4d.PAIRS
     real = _judged.held(config, "test", names)
     forest = _judged.forest(config, names, config.trees)
-    files = config.models or (None,)
     shares = []
-    for path in files:
-        drawn = _judged.drawn(pipeline.load(path), real, samples=config.samples, seed=config.seed)
+    for models in judged:
+        drawn = _judged.drawn(models, real, samples=config.samples, seed=config.seed)
         shares.append(_judged.recognised(forest, drawn, real.scale))
     each = np.mean(shares, axis=0)
     metrics = {
@@ -63,7 +63,7 @@ def run(config: Config) -> dict[str, Any]:
         "people": real.people,
     }
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
-    _run.finish("classification", config, metrics, made=made, table=_table(config, metrics, len(files)))
+    _run.finish("classification", config, metrics, made=made, table=_table(config, metrics, len(judged)))
     return metrics
 
 

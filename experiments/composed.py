@@ -53,14 +53,13 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Compose, and measure along the way."""
     begun = time.perf_counter()
+    judged = _judged.models_of(config)
     chains = random_chains(config.chains, config.seed)
     steps = {pair for labels in (*FIVE, *chains) for pair in zip(labels[:-1], labels[1:], strict=True)}
     real = _judged.held(config, "test", sorted(steps))
     of = {name: i for i, name in enumerate(real.names)}
     rows, errors = [], []
-    paths = config.models or (None,)
-    for path in paths:
-        models = pipeline.load(path)
+    for models in judged:
         errors.append([_errors(models, config, labels, real, of) for labels in FIVE])
         rows.append([_chain(models, config, i, labels, real, of) for i, labels in enumerate(chains)])
     davies = np.array([[row["davies_mm"] for row in each] for each in rows])  # models, chains, samples, transitions
@@ -82,7 +81,7 @@ def run(config: Config) -> dict[str, Any]:
         "people": real.people,
     }  # fmt: skip
     figure = _plot(config.out, found)
-    _picture(config.out, pipeline.load(paths[0]), chains[0], config.seed)
+    _picture(config.out, judged[0], chains[0], config.seed)
     data = _judged.data_of(config)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("composed", config, found, made=made, table=_table(found), figure=figure)

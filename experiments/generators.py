@@ -70,7 +70,7 @@ def run(config: Config) -> dict[str, Any]:
     begun = time.perf_counter()
     unknown = [name for name in config.variants if name not in VARIANTS]
     if unknown:
-        raise ValueError(f"--variants: unknown {', '.join(unknown)}; there are {', '.join(VARIANTS)}")
+        raise ValueError(f"--variants: unknown {_quoted(unknown)}; there are {_quoted(VARIANTS)}")
     data = _judged.data_of(config)
     examples = functools.cache(lambda source: _examples(data, source))
     judge = functools.cache(lambda: _judge(config))
@@ -100,6 +100,10 @@ def run(config: Config) -> dict[str, Any]:
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("generators", config, metrics, made=made, table=_table(table, real), figure=figure)
     return metrics
+
+
+def _quoted(names) -> str:
+    return ", ".join(f'"{name}"' for name in names)
 
 
 def weights_of(out: Path, name: str, seed: int) -> Path:

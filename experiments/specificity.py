@@ -22,7 +22,6 @@ import matplotlib
 import numpy as np
 
 from experiments import _judged, _run
-from facejax import pipeline
 from facejax.data import makehuman4d
 
 matplotlib.use("Agg")
@@ -45,13 +44,12 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Generate, and measure against real people."""
     begun = time.perf_counter()
+    judged = _judged.models_of(config)
     names = makehuman4d.PAIRS
     real = _judged.held(config, "test", names)
     train = _judged.seen(config, real.pairs, real.scale, TRAINED)
     each, frames, norms, seconds = [], [], [], []
-    files = config.models or (None,)
-    for path in files:
-        models = pipeline.load(path)
+    for models in judged:
         found = _judged.drawn(models, real, samples=config.samples, seed=config.seed)
         norms.append(_judged.norm_error(models, real.pairs, samples=config.samples, seed=config.seed))
         seconds.append(_judged.seconds(models, real, samples=config.samples, seed=config.seed))
@@ -84,7 +82,7 @@ def run(config: Config) -> dict[str, Any]:
     data = _judged.data_of(config)
     figure = _plot(config.out, names, np.mean(frames, axis=0), _per_frame(others, real))
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
-    table = _table(metrics, len(files))
+    table = _table(metrics, len(judged))
     _run.finish("specificity", config, metrics, made=made, table=table, figure=figure)
     return metrics
 

@@ -4,7 +4,7 @@ Makes one web page that needs no network: two examples of the scale's ends, then
 own, animations that are scored from 0 to 10 for naturalness (NAT) and for faithfulness to the label (LAB). Neither the
 page nor a participant's file says how an animation was made; `items.json` does: keep it.
 
-    python -m experiments.user_study --predecessor runs/ct22/ct22.safetensors
+    python -m experiments.user_study --predecessor runs/predecessor/makehuman4d.safetensors
     python -m experiments.user_study --scores runs/user_study/scores
 
 The first makes `page.html` and `items.json`, about 3 minutes on 2 cores; the second makes the table of the files that

@@ -31,7 +31,7 @@ class Generate:
     then: UseAppendAction[tuple[str, ...]] = ()
     """A further expression; repeat the flag: `--then A --then B`."""
     face: Path | None = None
-    """Neutral face (PLY, OBJ or NPZ): the model's 3,260 vertices, or a MakeHuman body. Default: the average face."""
+    """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average."""
     model: Path | None = None
     """Weights to use in place of the released ones."""
     seed: int = 7
@@ -146,7 +146,7 @@ class View:
     """Show an animation or a mesh: writes one HTML page and opens it."""
 
     file: Positional[Path]
-    """NPZ with `vertices` and `faces`, PLY, OBJ, or an HTML page made before."""
+    """NPZ with `vertices` and `faces`, PLY, OBJ, GLB, or an HTML page made before."""
     out: Path | None = None
     """Where the page goes; beside the file by default."""
     fps: float | None = None
@@ -208,6 +208,11 @@ def _animate(command: Animate) -> None:
         raise ValueError(f"--landmarks {command.landmarks}: of which mesh? name it with --mesh")
     if command.mesh is not None and command.person is not None:
         raise ValueError(f"--person {command.person} and --mesh {command.mesh}: name one of them")
+    own = {"expression": ("whole",), "end": ("start", "then", "seed"), "livelink": ("begin", "seconds", "keep_rest")}
+    for driver in set(drivers) - {named[0][2:]}:
+        for name in own[driver]:
+            if getattr(command, name) != getattr(Animate, name):
+                raise ValueError(f"--{name.replace('_', '-')} goes with --{driver}, not with {named[0]}")
     person = None if command.person is None else makehuman.subject(command.person)
     shown = {"fps": command.fps, "formats": command.formats}
     if command.livelink is not None:

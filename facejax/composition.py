@@ -37,24 +37,38 @@ def compose(
     labels: Sequence[int],
     *,
     samples: int = 1,
-    frames: Sequence[int] | None = None,
+    frames: int | Sequence[int] | None = None,
 ) -> jax.Array:
     """Motions through label numbers A, B, C, ...: (S, F, L, 3), `frames` of each transition (by default as drawn).
 
-    Sample i is the same whatever the number of samples. Raises `ValueError` for fewer than two labels, a label that
-    follows itself, no samples, or frames that do not fit.
+    Sample i is the same whatever the number of samples. Labels are known when a function is traced, not traced
+    themselves: `draw` takes traced ones. Raises `TypeError` for what is no generator, `ValueError` for fewer than two
+    labels, one that the generator does not know, one that follows itself, no samples, or frames that do not fit.
     """
-    drawn = draw(generator, beginnings, keys_of(key, samples), pairs_of(labels))
+    generators.kind(generator)
+    pairs = pairs_of(labels, classes=len(generator.chart.mean))
+    drawn = draw(generator, beginnings, keys_of(key, samples), pairs)
     count, length = drawn.curves.shape[1:3]
-    line = timeline([length] * count if frames is None else frames, drawn=length)
-    return join(drawn.curves, jnp.asarray(line))
+    each = [length if frames is None else frames] * count if np.ndim(frames) == 0 else frames
+    if len(each) != count:
+        raise ValueError(f"frames: expected one number, or {count} for {count} transitions, got {len(each)}")
+    return join(drawn.curves, jnp.asarray(timeline(each, drawn=length)))
 
 
-def pairs_of(labels: Sequence[int]) -> jax.Array:
-    """The transitions (P, 2) through label numbers. Raises `ValueError` for a label that follows itself."""
+def pairs_of(labels: Sequence[int], *, classes: int | None = None) -> jax.Array:
+    """The transitions (P, 2) through label numbers.
+
+    Raises `ValueError` for names, a number outside 0..classes-1, or a label that follows itself.
+    """
     labels = np.asarray(labels)
     if labels.ndim != 1 or len(labels) < 2:
         raise ValueError(f"labels: expected at least a start and an end, got {labels.tolist()}")
+    if labels.dtype.kind not in "iu":
+        raise ValueError(f"labels: expected numbers, got {labels.tolist()}; pipeline.label_indices makes them of names")
+    outside = np.flatnonzero((labels < 0) | (labels >= (np.inf if classes is None else classes)))
+    if outside.size:
+        last = "" if classes is None else f" to {classes - 1}"
+        raise ValueError(f"labels: number {outside[0] + 1} is {labels[outside[0]]}, expected one from 0{last}")
     if (same := np.flatnonzero(labels[1:] == labels[:-1])).size:
         raise ValueError(f"labels: number {same[0] + 2} repeats the one before; a transition needs two labels")
     return jnp.asarray(np.stack([labels[:-1], labels[1:]], axis=1), jnp.int32)

@@ -103,7 +103,12 @@ def everything(
 def chart_of(
     known: motions.Motions, *, labels: int, rank: int = 128, pose: int = 32, mean: str = "karcher"
 ) -> charts.Chart:
-    """The chart of a training set, at the "karcher" mean of its motions, or their normalised "extrinsic" one."""
+    """The chart of a training set, at the "karcher" mean of its motions, or their normalised "extrinsic" one.
+
+    Its R = `rank` directions need more motions than that. Raises `ValueError` for labels beyond labels-1.
+    """
+    if (highest := max(known.start.max(), known.end.max())) >= labels:
+        raise ValueError(f"labels: expected more than {highest}, the highest label of the motions; got {labels}")
     if mean not in ("karcher", "extrinsic"):
         raise ValueError(f'mean: expected "karcher" or "extrinsic", got {mean!r}')
     q, log_length = srvf.encode(jnp.asarray(known.curves))
@@ -115,10 +120,10 @@ def chart_of(
     )  # fmt: skip
 
 
-def examples_of(chart: charts.Chart, parts: Iterable[motions.Motions]) -> Examples:
+def examples_of(chart: charts.Chart, parts: motions.Motions | Iterable[motions.Motions]) -> Examples:
     """Motions in a chart's coordinates; parts are forgotten one after the other."""
     rows = []
-    for part in parts:
+    for part in [parts] if isinstance(parts, motions.Motions) else parts:
         values, pose = _place(chart, part.curves, np.log(part.seconds), part.start, part.end)
         rows.append(Examples(np.asarray(values), part.start, part.end, np.asarray(pose)))
     return Examples(*(np.concatenate(fields) for fields in zip(*rows, strict=True)))
@@ -149,7 +154,11 @@ def fit_gan(
     seed: int = 0,
     average: bool = True,
 ) -> motion.Params:
-    """Train the generator against its critic; returns its moving average, or with `average` off its last state."""
+    """Train the generator against its critic; returns its moving average, or with `average` off its last state.
+
+    Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
+    and another plan in it is refused.
+    """
     config = _sized(config, chart)
     _claim(folder, "gan", plan, config, seed, examples.values)
     generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
@@ -190,7 +199,7 @@ def fit_flow(
     config: flow.Config = flow.Config(),
     seed: int = 0,
 ) -> flow.Params:
-    """Train a velocity field; returns its moving average."""
+    """Train a velocity field; returns its moving average. Chart, config and folder as in `fit_gan`."""
     config = _sized(config, chart)
     _claim(folder, "flow", plan, config, seed, examples.values)
     init_key, run_key = jax.random.split(jax.random.key(seed))
@@ -304,6 +313,8 @@ def _sized(config, chart: charts.Chart):
 
 
 def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> None:
+    if plan.steps < 1:
+        raise ValueError(f"plan: expected 1 step or more, got {plan.steps}")
     digest = hashlib.sha256(np.ascontiguousarray(known)).hexdigest()
     record = {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest, "kind": kind}
     journal.claim(folder, record)

@@ -155,15 +155,28 @@ def captions(labels: Sequence[str], *, frames: int | Sequence[int] = FRAMES) -> 
 
 
 def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Array:
-    """The landmarks (L, 3) of a neutral face (N, 3). Raises `ValueError` for another vertex count."""
+    """The landmarks (L, 3) of a neutral face (N, 3).
+
+    Raises `ValueError` for another vertex count, or a size that no head has in millimetres.
+    """
     expected = models.face.vertices.shape
     if np.shape(neutral) != expected:
         raise ValueError(f"neutral: expected vertices {expected} in the models' topology, got {np.shape(neutral)}")
+    if not isinstance(neutral, jax.core.Tracer):
+        size, usual = (
+            np.linalg.norm(np.ptp(np.asarray(x)[models.face.landmark_index], axis=0))
+            for x in (neutral, models.face.vertices)
+        )
+        if not usual / 3 < size < 3 * usual:
+            raise ValueError(
+                f"neutral: its landmarks span {size:.4g}, expected about {usual:.0f} mm: give vertices in millimetres"
+            )
     return jnp.asarray(neutral, jnp.float32)[models.face.landmark_index]
 
 
 def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
     """Indices of label names. Raises `ValueError` with the nearest names for an unknown one."""
+    _check_names(labels)
     for name in labels:
         if name not in models.labels:
             near = difflib.get_close_matches(name, models.labels, n=3, cutoff=0.4)
@@ -172,7 +185,13 @@ def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
     return np.array([models.labels.index(name) for name in labels], np.int32)
 
 
+def _check_names(labels: Sequence[str]) -> None:
+    if isinstance(labels, str):
+        raise ValueError(f"labels: expected a sequence of names, got the one name {labels!r}")
+
+
 def _numbers(models: Models, labels: Sequence[str]) -> np.ndarray:
+    _check_names(labels)
     for before, after in zip(labels[:-1], labels[1:], strict=True):
         if before == after:
             raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")

@@ -271,6 +271,7 @@ def test_bad_requests_to_animate_get_one_line(capsys, tmp_path, networks, odd_he
     assert "kernel: expected one of" in told(*ours, "--kernel", "cubic")
     assert "intensity" in told(*ours, "--intensity", "3")
     assert "no such file" in told("--livelink", tmp_path / "no.csv")
+    assert "--begin goes with --livelink, not with --end" in told("--end", "anger", "--begin", "3")
     assert "has nothing at 50 s" in told("--livelink", recorded(tmp_path / "t.csv"), "--begin", "50")
     io.landmarks.write(tmp_path / "few.json", points=0.05 * np.eye(3))
     assert "no scheme of 3 landmarks" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "few.json")

@@ -236,11 +236,27 @@ def test_long_chains_of_the_released_generator_stay_finite_and_strong():
     np.testing.assert_allclose(curves[:, -1], 0, atol=1e-6)
 
 
+def test_compose_knows_its_labels_and_one_length_serves_all(made, beginnings):
+    chain = made["flow"], beginnings, jax.random.key(2)
+    with pytest.raises(ValueError, match="number 3 is 99"):
+        composition.compose(*chain, [0, 1, 99])
+    with pytest.raises(ValueError, match="2 for 2 transitions, got 3"):
+        composition.compose(*chain, [0, 1, 0], frames=[5, 5, 5])
+    with pytest.raises(TypeError, match="parameters of a generator"):
+        composition.compose(made, *chain[1:], [0, 1])
+    one, each = (composition.compose(*chain, [0, 1, 0], frames=frames) for frames in (5, [5, 5]))
+    np.testing.assert_array_equal(one, each)
+    assert one.shape[1] == 9
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: composition.pairs_of([1]), "a start and an end"),
         (lambda: composition.pairs_of([0, 1, 1]), "number 3 repeats the one before"),
+        (lambda: composition.pairs_of(["neutral", "anger"]), "expected numbers.*pipeline.label_indices"),
+        (lambda: composition.pairs_of([0, -1]), "number 2 is -1, expected one from 0$"),
+        (lambda: composition.pairs_of([0, 3], classes=3), "number 2 is 3, expected one from 0 to 2"),
         (lambda: composition.keys_of(jax.random.key(0), 0), "samples must be 1 or more"),
         (lambda: composition.timeline([30, 1]), r"2 or more for each transition, got \[30, 1\]"),
         (lambda: composition.join(random_curves(2), jnp.eye(6)), r"expected \(F, 12\) for 2 x 6 frames"),

@@ -57,6 +57,16 @@ def test_examples_are_the_motions_in_the_chart(known, chart, examples):
         np.testing.assert_allclose(examples.values[rows, 2:].mean(axis=0), chart.mean[a, b], atol=2e-3)
 
 
+def test_wrong_requests_are_named(known, chart, examples, tmp_path):
+    with pytest.raises(ValueError, match="the highest label of the motions; got 2"):
+        fit_motion.chart_of(known, labels=2)
+    with pytest.raises(ValueError, match="1 step or more, got 0"):
+        fit_motion.fit_flow(examples, chart, tmp_path / "none", plan=fit_motion.FlowPlan(steps=0))
+    assert not (tmp_path / "none").exists()
+    for whole, parts in zip(fit_motion.examples_of(chart, known), fit_motion.examples_of(chart, [known]), strict=True):
+        np.testing.assert_array_equal(whole, parts)
+
+
 def test_the_papers_set_has_the_papers_size():
     """12 people, 12 expressions: 288 halves, 48 of each of 132 ordered pairs: about 6,740; one of each held out."""
     data = recorded(subjects=12, labels=("neutral", *performance.COMA))

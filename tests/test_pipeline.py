@@ -147,6 +147,12 @@ def test_wrong_shapes_are_named(models, person):
         pipeline.landmarks(models, KEY, ["neutral", "anger"], np.zeros((10, 3)))
     with pytest.raises(ValueError, match=r"landmarks: expected \(..., 68, 3\)"):
         pipeline.meshes(models, np.zeros((5, 51, 3)), person.vertices)
+    with pytest.raises(ValueError, match=r"expected about .* mm: give vertices in millimetres"):
+        pipeline.landmarks(models, KEY, ["neutral", "anger"], person.vertices / 1000)
+    with pytest.raises(ValueError, match="got the one name 'anger'"):
+        pipeline.landmarks(models, KEY, "anger", person.vertices)
+    inside = jax.jit(lambda face: pipeline.neutral_landmarks(models, face))(person.vertices)
+    np.testing.assert_array_equal(inside, pipeline.neutral_landmarks(models, person.vertices))
 
 
 def test_saved_models_load_the_same(models, person, tmp_path):

@@ -63,6 +63,7 @@ def fit(
 ) -> Chart:
     """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), first frames `here` (M, L, 3).
 
+    Of `motion` the log-length and log-seconds (M,) are read; `start`, `end` are labels (M,) in 0..labels-1.
     The directions span the R principal ones of all tangent vectors, and are turned within that span so that
     the spread within label pairs is uncorrelated. Pairs without a motion get the sum of a start's and an
     end's effect as mean; pairs with fewer than 8 the spread of all.

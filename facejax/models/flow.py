@@ -123,7 +123,12 @@ def unwrap(chart: Chart, state: State, start, end) -> Motion:
 
 @partial(jax.jit, static_argnames="steps")
 def sample(params: Params, key: jax.Array, start, end, pose: jax.Array, *, steps: int = STEPS) -> Motion:
-    """Draw a motion between two labels that starts at a pose (D,): `steps` midpoint steps along the field."""
+    """Draw a motion between two labels that starts at a pose (D,): `steps` midpoint steps along the field.
+
+    Raises `ValueError` for fewer than one step.
+    """
+    if steps < 1:
+        raise ValueError(f"steps of integration: expected 1 or more, got {steps}")
     state = source(params.chart, key, start, end, pose)
 
     def advance(state: State, time: jax.Array) -> tuple[State, None]:

@@ -16,15 +16,25 @@ KINDS = {"gan": motion.Params, "reference": motion_reference.Params, "flow": flo
 
 @partial(jax.jit, static_argnames="steps")
 def sample(params: Params, key: jax.Array, start, end, pose: jax.Array, *, steps: int = flow.STEPS) -> Motion:
-    """Draw a motion between two labels that starts at a pose (D,). `steps` of integration are the flow's alone."""
+    """Draw a motion between two labels that starts at a pose (D,): q (T-1, L, 3), log-length and log-seconds ().
+
+    `start`, `end` are label numbers (0: neutral), which are taken as they come: `pipeline.label_indices` checks names.
+    A pose to start from is drawn by `starts.sample`, measured by `charts.pose`, or zero: the mean peak. `steps` of
+    integration are the flow's alone. The curve of a motion is `srvf.decode(q, log_length, charts.unpose(chart, pose,
+    start))`: displacements from neutral, unitless. On this sphere a point's Frobenius norm is the root of T-1.
+    Raises `TypeError` for parameters that are no generator's.
+    """
     if isinstance(params, flow.Params):
         return flow.sample(params, key, start, end, pose, steps=steps)
     return _module(params).sample(params, key, start, end, pose)
 
 
 def kind(params: Params) -> str:
-    """ "gan", "reference" or "flow"."""
-    return next(name for name, of in KINDS.items() if isinstance(params, of))
+    """ "gan", "reference" or "flow". Raises `TypeError` for anything else."""
+    for name, of in KINDS.items():
+        if isinstance(params, of):
+            return name
+    raise TypeError(f"expected the parameters of a generator, such as models.motion; got {type(params).__name__}")
 
 
 def heeds_pose(params: Params) -> bool:
@@ -33,4 +43,4 @@ def heeds_pose(params: Params) -> bool:
 
 
 def _module(params: Params):
-    return motion if isinstance(params, motion.Params) else motion_reference
+    return {"gan": motion, "reference": motion_reference, "flow": flow}[kind(params)]

@@ -58,3 +58,13 @@ def test_under_vmap_each_sample_is_the_one_of_its_key_labels_and_pose(made):
 def test_steps_of_integration_are_the_flows(made):
     few, many = (generators.sample(made["flow"], KEY, 1, 2, POSE, **steps) for steps in ({"steps": 2}, {}))
     assert float(sphere.distance(few.q, many.q)) > 1e-4
+
+
+def test_wrong_requests_are_named(made):
+    with pytest.raises(TypeError, match=r"parameters of a generator.*got dict"):
+        generators.kind(made)
+    with pytest.raises(TypeError, match="got tuple"):
+        generators.sample((1, 2), KEY, 0, 1, POSE)
+    for steps in (0, -1):
+        with pytest.raises(ValueError, match=f"1 or more, got {steps}"):
+            generators.sample(made["flow"], KEY, 1, 2, POSE, steps=steps)
