@@ -59,7 +59,7 @@ class Config(_judged.People):
     """Of the flow."""
     gan_steps: int = fit_motion.GanPlan().steps
     """Of the GAN."""
-    reference_steps: int = 1000
+    reference_steps: int = 500
     """Of the authors' GAN, of which a sample costs as much as a batch of the others."""
     reference_batch: int = 16
     """Its samples in a step."""
