@@ -182,6 +182,7 @@ def _plot(out: Path, found: dict[str, Any]) -> Path:
     left.set_ylim(0, 1.4 * max(max(curve) for curve in found["error_per_frame_mm"].values()))
     left.legend(frameon=False, fontsize=7, loc="upper left")
     right.bar(np.arange(1, TRANSITIONS + 1), found["davies_each_mm"], color="#5b8db8")
+    right.set_xticks([1, *range(5, TRANSITIONS + 1, 5)])
     right.set_xlabel("transition of the chain")
     right.set_ylabel("distance to the nearest real motion, mm")
     out.mkdir(parents=True, exist_ok=True)

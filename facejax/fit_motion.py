@@ -286,7 +286,7 @@ def fit_reference(
         folder,
         steps=plan.steps,
         constants=((real, pair), chart),
-        chunk=10,
+        chunk=1,
         save_seconds=120.0,
     )
     return motion_reference.Params(chart, state.extra)

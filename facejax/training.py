@@ -101,6 +101,9 @@ def run(
 
     @jax.jit(donate_argnums=0)
     def advance(state: TrainState, data: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
+        if chunk == 1:  # no loop: within one, XLA runs convolutions on a CPU several times slower
+            state, metrics = step(state, jax.tree.map(lambda x: x[0], data), constants)
+            return state, jax.tree.map(lambda value: value[None], metrics)
         return jax.lax.scan(lambda state, batch: step(state, batch, constants), state, data)
 
     with Checkpoints(folder / "checkpoints", keep=keep) as checkpoints, _stop_signals() as stopped:

@@ -71,6 +71,16 @@ def test_supervised_steps_are_the_plain_loop(tmp_path):
     np.testing.assert_allclose([e["loss"] for e in got], means, rtol=1e-5)
 
 
+def test_without_a_loop_the_steps_are_the_same(tmp_path):
+    step = steps.supervised(loss, OPTIMISER)
+    single = training.run(
+        step, start(), batches, tmp_path / "single", steps=6, constants=jnp.float32(0.5), chunk=1, save_steps=3
+    )
+    looped = fit(tmp_path / "looped", 6)
+    np.testing.assert_allclose(single.params["w"], looped.params["w"], rtol=1e-6)
+    assert [entry["step"] for entry in entries(tmp_path / "single")] == [1, 2, 3, 4, 5, 6]
+
+
 def test_a_run_in_pieces_gives_the_same_bits(tmp_path):
     whole = fit(tmp_path / "whole", 20)
     for total in (8, 8, 12, 20):
