@@ -119,7 +119,7 @@ def test_generators(own_cache, tmp_path, monkeypatch):
     before = (tmp_path / "o" / "flow-1.safetensors").stat().st_mtime_ns
     generators.run(config)  # nothing is trained again
     assert (tmp_path / "o" / "flow-1.safetensors").stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match="--variants: unknown diffusion; there are gaussian, flow"):
+    with pytest.raises(ValueError, match='--variants: unknown "diffusion"; there are "gaussian", "flow"'):
         generators.run(generators.Config(out=tmp_path / "o", variants=("diffusion",)))
 
 
