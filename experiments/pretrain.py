@@ -185,7 +185,7 @@ def _decoder(config: Config, data: store.Store, hierarchy):
 
 
 class _timed:
-    """Seconds spent in a folder's run, over all its sittings."""
+    """Seconds spent in a folder's run, however often it was stopped."""
 
     def __init__(self, folder: Path):
         self.path = folder / "seconds.json"
