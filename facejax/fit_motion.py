@@ -199,7 +199,11 @@ def fit_flow(
     config: flow.Config = flow.Config(),
     seed: int = 0,
 ) -> flow.Params:
-    """Train a velocity field; returns its moving average. Chart, config and folder as in `fit_gan`."""
+    """Train a velocity field; returns its moving average. Chart, config and folder as in `fit_gan`.
+
+    Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
+    exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
+    """
     config = _sized(config, chart)
     _claim(folder, "flow", plan, config, seed, examples.values)
     init_key, run_key = jax.random.split(jax.random.key(seed))

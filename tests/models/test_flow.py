@@ -161,11 +161,13 @@ def test_wrong_charts_are_named(chart):
 @pytest.mark.slow
 def test_the_flow_learns_both_styles():
     """Two styles along the first direction, where the Gaussian that it starts from has one hump."""
-    chart = fitted(toy(3000), labels=3, rank=8)
+    # Of the four directions that the toy spreads along: in a fifth, without spread, the sphere's curvature is all that
+    # there is to learn, and drowns the rest.
+    chart = fitted(toy(3000), labels=3, rank=4)
     _, tangents, made, start, end, here = toy(3000)
     real = jax.vmap(charts.coordinates, (None, 0, 0, 0, 0, 0))(chart, tangents, *made[1:], start, end)
     poses = jax.vmap(charts.pose, (None, 0, 0))(chart, here, start)
-    weights = flow.init(jax.random.key(0), chart, config=CONFIG._replace(width=96)).weights
+    weights = flow.init(jax.random.key(0), chart, config=CONFIG._replace(width=96, rank=4)).weights
 
     def loss(weights, key, batch, chart):
         found, condition = batch
