@@ -159,15 +159,27 @@ def test_wrong_charts_are_named(chart):
 
 
 @pytest.mark.slow
-def test_the_flow_learns_both_styles():
+@pytest.mark.parametrize(
+    "rank",
+    [
+        4,  # the directions that the toy spreads along
+        pytest.param(
+            8,
+            marks=pytest.mark.xfail(
+                strict=True,
+                raises=AssertionError,
+                reason="not solved: along directions without spread within a pair errors count without bound",
+            ),
+        ),
+    ],
+)
+def test_the_flow_learns_both_styles(rank):
     """Two styles along the first direction, where the Gaussian that it starts from has one hump."""
-    # Of the four directions that the toy spreads along: in a fifth, without spread, the sphere's curvature is all that
-    # there is to learn, and drowns the rest.
-    chart = fitted(toy(3000), labels=3, rank=4)
+    chart = fitted(toy(3000), labels=3, rank=rank)
     _, tangents, made, start, end, here = toy(3000)
     real = jax.vmap(charts.coordinates, (None, 0, 0, 0, 0, 0))(chart, tangents, *made[1:], start, end)
     poses = jax.vmap(charts.pose, (None, 0, 0))(chart, here, start)
-    weights = flow.init(jax.random.key(0), chart, config=CONFIG._replace(width=96, rank=4)).weights
+    weights = flow.init(jax.random.key(0), chart, config=CONFIG._replace(width=96, rank=rank)).weights
 
     def loss(weights, key, batch, chart):
         found, condition = batch
