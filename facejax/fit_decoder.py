@@ -47,11 +47,7 @@ def fit(
     data = meshes.data
     chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
     journal.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
-    template = np.asarray(data.neutral[np.unique(meshes.owner)], np.float64).mean(axis=0)
-    weights = losses.landmark_weights(
-        jnp.asarray(template, jnp.float32), jnp.asarray(data.landmark_index), mode=plan.weighting,
-        edge_length=_edge_length(template, data.faces),
-    )  # fmt: skip
+    weights = vertex_weights(meshes, plan.weighting)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     scale = decoder.measure(meshes)
     params = decoder.init(init_key, hierarchy, landmarks=len(data.landmark_index), scale=scale)
@@ -76,6 +72,15 @@ def fit(
         chunk=50,
     )
     return decoder.Params(scale, state.params)
+
+
+def vertex_weights(meshes: Meshes, weighting: str) -> jax.Array:
+    """`losses.landmark_weights` (N,) on the mean neutral face of the meshes' subjects."""
+    template = np.asarray(meshes.data.neutral[meshes.subjects], np.float64).mean(axis=0)
+    return losses.landmark_weights(
+        jnp.asarray(template, jnp.float32), jnp.asarray(meshes.data.landmark_index), mode=weighting,
+        edge_length=_edge_length(template, meshes.data.faces),
+    )  # fmt: skip
 
 
 def mesh_batches(meshes: Meshes, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:

@@ -42,17 +42,46 @@ class Meshes:
         """Those under a mask (G,)."""
         return dataclasses.replace(self, at=self.at[keep], owner=self.owner[keep])
 
+    def rows(self, which: np.ndarray) -> Meshes:
+        """Those at positions (n,), rising, of this selection."""
+        return dataclasses.replace(self, at=self.at[which], owner=self.owner[which])
+
     def of_labels(self, labels: Sequence[str], *, without: bool = False) -> Meshes:
         """Those of frames that show one of the labels, or none of them."""
-        named = self.data.row_labels()[self.data.drawn[self.at]]
-        return self.where(np.isin(named, list(labels)) != without)
+        return self.where(np.isin(self.labels, list(labels)) != without)
 
-    def folds(self, count: int) -> list[tuple[Meshes, Meshes]]:
-        """(fit, held out) for each of `count` groups of subjects."""
-        groups = np.array_split(np.unique(self.owner), count)
-        return [(self.where(~np.isin(self.owner, g)), self.where(np.isin(self.owner, g))) for g in groups]
+    @property
+    def labels(self) -> np.ndarray:
+        """The label of each mesh's recording, (G,) strings."""
+        return self.data.row_labels()[self.data.drawn[self.at]]
+
+    @property
+    def subjects(self) -> np.ndarray:
+        """Whose meshes there are, in order."""
+        return np.unique(self.owner)
+
+    def folds(self, count: int, *, by: str = "subjects") -> list[tuple[Meshes, Meshes]]:
+        """(fit, held out) for each of `count` groups of subjects, or of `by="labels"`, in sorted order."""
+        if by not in ("subjects", "labels"):
+            raise ValueError(f"by: expected 'subjects' or 'labels', got {by!r}")
+        of = self.owner if by == "subjects" else self.labels
+        if not 2 <= count <= len(np.unique(of)):
+            raise ValueError(f"expected 2 to {len(np.unique(of))} folds of {len(np.unique(of))} {by}, got {count}")
+        groups = np.array_split(np.unique(of), count)
+        return [(self.where(~np.isin(of, g)), self.where(np.isin(of, g))) for g in groups]
+
+    def thin(self, step: int) -> Meshes:
+        """Every `step`-th mesh."""
+        return self.where(np.arange(self.count) % step == 0)
+
+    def person(self, subject: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A subject's neutral face (N, 3) and its meshes as `read` gives them."""
+        return np.asarray(self.data.neutral[subject]), *self.read(np.flatnonzero(self.owner == subject))
 
 
-def of_split(data: store.Store, split: str, *, size: int = 256) -> Meshes:
-    """The meshes of a split's subjects."""
-    return Meshes(data, *data.meshes(split), size)
+def of_split(data: store.Store, *splits: str, size: int = 256) -> Meshes:
+    """The meshes of the subjects of one or more splits, in the order in which they are stored."""
+    found = [data.meshes(split) for split in splits]
+    at, owner = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.argsort(at, kind="stable")
+    return Meshes(data, at[order], owner[order], size)

@@ -21,6 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from facejax.data import assets, contact, makehuman, skin
+from facejax.mesh import transfer
 
 LEVELS = (0, 1, 2, 3)
 SATURATION = 0.35  # f(w) = (1 + k) w / (1 + k |w|): f(1) = 1, f(0.5) = 0.57
@@ -147,8 +148,8 @@ def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     """
     loaded = assets.load()
     n = loaded.skin
-    source, _ = gradient(makehuman.template().vertices.astype(np.float64), loaded.faces)
-    target, areas = gradient(neutral[:n], loaded.faces)
+    source, _ = transfer.gradient(makehuman.template().vertices.astype(np.float64), loaded.faces)
+    target, areas = transfer.gradient(neutral[:n], loaded.faces)
     weight = sparse.diags(np.repeat(areas, 3))
     offsets = np.moveaxis(units[:, :n], 1, 0).reshape(n, -1)
     still = np.abs(offsets).max(axis=1) < 1e-6
@@ -159,19 +160,3 @@ def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     carried = units.copy()
     carried[:, :n] = np.moveaxis(solved.reshape(n, len(units), 3), 0, 1)
     return carried
-
-
-def gradient(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """The operator from vertex values (N,) to constant gradients per triangle (3F,), and the areas (F,)."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    double = np.linalg.norm(normal, axis=1, keepdims=True)
-    unit = normal / double
-    # The gradient of a corner's hat function is the opposite edge turned by a right angle, over twice the area.
-    corners = [np.cross(unit, edge) / double for edge in (c - b, a - c, b - a)]
-    rows = (3 * np.arange(len(faces))[:, None] + np.arange(3)).ravel()
-    parts = [
-        sparse.csr_matrix((g.ravel(), (rows, np.repeat(faces[:, i], 3))), shape=(3 * len(faces), len(vertices)))
-        for i, g in enumerate(corners)
-    ]
-    return sum(parts[1:], parts[0]), double[:, 0] / 2

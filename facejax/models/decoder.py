@@ -53,6 +53,20 @@ def init(
     upsamplings. Without `scale`, displacements are taken as they are. Raises `ValueError` where the
     numbers of levels do not fit.
     """
+    weights = init_weights(key, hierarchy, inputs=3 * landmarks, channels=channels, outputs=3)
+    weights["convs"][-1]["kernel"] *= 0.01
+    if scale is None:
+        scale = Scale(jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.zeros((hierarchy.sizes[0], 3)), jnp.ones(()))
+    return Params(scale, weights)
+
+
+def init_weights(
+    key: jax.Array, hierarchy: Hierarchy, *, inputs: int, channels: Sequence[int], outputs: int | None
+) -> Weights:
+    """Random weights of `expand`, from `inputs` numbers to `outputs` per vertex; without outputs, of `climb`.
+
+    `channels` as in `init`. Raises `ValueError` where the numbers of levels do not fit.
+    """
     climbs = hierarchy.climbs[::-1]
     if len(channels) != len(climbs) + 1:
         raise ValueError(f"channels: expected {len(climbs) + 1} for this hierarchy, got {len(channels)}")
@@ -61,16 +75,31 @@ def init(
     convs = [
         {"kernel": he(k, (len(stencil.source), inward, outward)), "bias": jnp.zeros(outward)}
         for k, stencil, inward, outward in zip(
-            conv_keys, (*climbs, hierarchy.surface), channels, (*channels[1:], 3), strict=True
+            conv_keys, (*climbs, hierarchy.surface), channels, (*channels[1:], outputs), strict=True
         )
+        if outward is not None
     ]
-    convs[-1]["kernel"] = 0.01 * convs[-1]["kernel"]
     coarse = hierarchy.sizes[-1] * channels[0]
     glorot = jax.nn.initializers.glorot_normal()
-    dense = {"kernel": glorot(dense_key, (3 * landmarks, coarse)), "bias": jnp.zeros(coarse)}
-    if scale is None:
-        scale = Scale(jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.zeros((hierarchy.sizes[0], 3)), jnp.ones(()))
-    return Params(scale, {"dense": dense, "convs": convs})
+    return {"dense": {"kernel": glorot(dense_key, (inputs, coarse)), "bias": jnp.zeros(coarse)}, "convs": convs}
+
+
+def expand(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
+    """A batch of vectors (B, inputs) -> a signal on the finest level (N, B, outputs), the batch inside."""
+    last = weights["convs"][-1]
+    return ops.spiral_conv(climb(weights, hierarchy, x), last["kernel"], hierarchy.surface) + last["bias"]
+
+
+def climb(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
+    """`expand` but for its last convolution: (B, inputs) -> (N, B, channels[-1])."""
+    x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
+    climbs = hierarchy.climbs[::-1]
+    convs = weights["convs"][: len(climbs)]
+    # The batch inside, as `ops` wants it.
+    x = x.reshape(len(x), hierarchy.sizes[-1], convs[0]["kernel"].shape[1]).transpose(1, 0, 2)
+    for conv, stencil in zip(convs, climbs, strict=True):
+        x = jax.nn.elu(ops.spiral_conv(x, conv["kernel"], stencil) + conv["bias"])
+    return x
 
 
 @partial(jax.jit, static_argnames="chunk")
@@ -116,14 +145,7 @@ def _decode(params: Params, hierarchy: Hierarchy, displacements: jax.Array) -> j
     """A chunk (B, 3 L) -> (B, N, 3)."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = (displacements - scale.landmark_mean.reshape(-1)) / scale.landmark_std
-    x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
-    *climbs, last = weights["convs"]
-    channels = climbs[0]["kernel"].shape[1]
-    # The batch inside, as `ops` wants it.
-    x = x.reshape(len(x), hierarchy.sizes[-1], channels).transpose(1, 0, 2)
-    for conv, stencil in zip(climbs, hierarchy.climbs[::-1], strict=True):
-        x = jax.nn.elu(ops.spiral_conv(x, conv["kernel"], stencil) + conv["bias"])
-    x = ops.spiral_conv(x, last["kernel"], hierarchy.surface) + last["bias"]
+    x = expand(weights, hierarchy, x)
     return scale.vertex_mean + scale.vertex_std * x.transpose(1, 0, 2)
 
 

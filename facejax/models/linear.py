@@ -72,6 +72,15 @@ def apply(params: Params, landmarks: jax.Array) -> jax.Array:
     return params.vertex_mean + x.reshape(*x.shape[:-1], -1, 3)
 
 
+def affine(landmark_mean: np.ndarray, vertex_mean: np.ndarray, *factors: np.ndarray) -> Params:
+    """Parameters in float32 from means (L, 3), (N, 3) and one or more factors whose product is (3 L, 3 N)."""
+    return Params(
+        jnp.asarray(landmark_mean, jnp.float32),
+        jnp.asarray(vertex_mean, jnp.float32),
+        tuple(jnp.asarray(factor, jnp.float32) for factor in factors),
+    )
+
+
 def choose(
     model: Model, folds: Sequence[tuple[Batches, Batches]], alphas: Sequence[float], **options
 ) -> tuple[float, np.ndarray]:
@@ -126,7 +135,7 @@ def _moments(batches: Batches) -> Moments:
 
 def _solve_ridge(moments: Moments, *, alpha: float) -> Params:
     """(covariance + alpha I) W = cross, with alpha in mm^2."""
-    _check_alpha(alpha)
+    check_alpha(alpha)
     penalised = moments.covariance + alpha * np.eye(len(moments.covariance))
     # Without a penalty a landmark that never moves makes this singular; then the least-norm solution is
     # meant.
@@ -135,7 +144,7 @@ def _solve_ridge(moments: Moments, *, alpha: float) -> Params:
         if alpha > 0
         else np.linalg.lstsq(penalised, moments.cross, rcond=1e-12)[0]
     )
-    return _single(moments.landmark_mean, moments.vertex_mean, solution)
+    return affine(moments.landmark_mean, moments.vertex_mean, solution)
 
 
 def _basis(batches: Batches, *, components: int, passes: int = 3, seed: int = 0) -> Basis:
@@ -197,14 +206,16 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
 
 def _solve_pca(basis: Basis, *, alpha: float) -> Params:
     """Coefficients (Y^T Y + alpha diag(1 / variance))^-1 Y^T x: most probable under noise of variance alpha."""
-    _check_alpha(alpha)
+    check_alpha(alpha)
     y = basis.landmarks.T
     normal = y.T @ y + alpha * np.diag(1 / basis.variance)
     encoder = np.linalg.lstsq(normal, y.T, rcond=1e-12)[0].T
-    return _single(basis.landmark_mean, basis.vertex_mean, encoder, basis.components)
+    return affine(basis.landmark_mean, basis.vertex_mean, encoder, basis.components)
 
 
-def _model(prepare: Callable, solve: Callable) -> Model:
+def model(prepare: Callable, solve: Callable) -> Model:
+    """A model from its two halves, `prepare(batches, **options)` and `solve(prepared, *, alpha)`."""
+
     def fit(batches: Batches, *, alpha: float, **options) -> Params:
         """Fit to batches with regularisation `alpha` in mm^2."""
         return solve(prepare(batches, **options), alpha=alpha)
@@ -224,18 +235,11 @@ def _flat(batches: Batches):
         yield *flat, shapes
 
 
-def _single(landmark_mean, vertex_mean, *factors) -> Params:
-    return Params(
-        jnp.asarray(landmark_mean, jnp.float32),
-        jnp.asarray(vertex_mean, jnp.float32),
-        tuple(jnp.asarray(factor, jnp.float32) for factor in factors),
-    )
-
-
-def _check_alpha(alpha: float) -> None:
+def check_alpha(alpha: float) -> None:
+    """Raise `ValueError` for a regularisation below 0."""
     if not alpha >= 0:
         raise ValueError(f"alpha: expected 0 or more, got {alpha}")
 
 
-ridge = _model(_moments, _solve_ridge)
-pca = _model(_basis, _solve_pca)
+ridge = model(_moments, _solve_ridge)
+pca = model(_basis, _solve_pca)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from facejax.data import assets, contact, makehuman, performance, rig, skin
+from facejax.mesh import transfer
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +127,7 @@ def test_deformation_transfer_follows_size():
 
 def test_gradient_of_a_linear_function_is_its_slope_in_the_plane(template):
     slope = np.array([0.3, -1.1, 0.7])
-    operator, areas = rig.gradient(template.vertices.astype(np.float64), template.faces)
+    operator, areas = transfer.gradient(template.vertices.astype(np.float64), template.faces)
     found = (operator @ (template.vertices @ slope)).reshape(-1, 3)
     a, b, c = (template.vertices[template.faces[:, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)

@@ -1,0 +1,155 @@
+"""Training the decoder of residuals on top of the best linear answer.
+
+The morphable model is chosen and fitted first (`facejax.fit_gpmm`). The network is trained on what its cross-
+validated answers leave over, which is what it will meet on new faces; a fourth of the people (or labels) is kept to
+choose the gate. Files in the folder: `base.npy` holds those answers, and goes when training is done."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from facejax import fit_gpmm, journal, steps, training
+from facejax.data.meshes import Meshes
+from facejax.mesh import strain
+from facejax.mesh.topology import Hierarchy
+from facejax.models import gpmm, linear, residual
+
+GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
+WORTH = 0.995  # a gate that is not 0 has to be better by half a hundredth
+BATCH = 16
+
+
+class Plan(NamedTuple):
+    """How the network is trained."""
+
+    steps: int = 2_500
+    batch: int = BATCH
+    rate: float = 2e-3  # decays to zero along a cosine
+    weight_decay: float = 1e-4
+    soft: float = (
+        0.1  # of the unit: below it the loss is squared. Wrinkles are sparse, and an absolute loss predicts none
+    )
+
+
+class Fitted(NamedTuple):
+    """Everything that `apply` needs."""
+
+    base: gpmm.Params
+    network: residual.Params
+    hierarchy: Hierarchy
+    tables: strain.Around
+
+
+def fit(
+    train: Meshes,
+    hierarchy: Hierarchy,
+    folder: str | os.PathLike,
+    *,
+    plan: Plan = Plan(),
+    by: str = "subjects",
+    seed: int = 0,
+    base: fit_gpmm.Fitted | None = None,
+) -> Fitted:
+    """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit."""
+    folder, data = Path(folder), train.data
+    chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
+    claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
+    journal.claim(folder, claim)
+    base = base or fit_gpmm.fit(train, by=by)
+    answers = base.held_out(train)
+    *_, (_, kept) = base.folds
+    seen = np.setdiff1d(np.arange(train.count), kept)
+    scale = _measure(train.where(np.isin(np.arange(train.count), seen)), answers[seen], base.params.face)
+    init_key, run_key = jax.random.split(jax.random.key(seed))
+    params = residual.init(init_key, hierarchy, scale)
+    tables = jax.device_put(strain.around(np.asarray(data.faces), len(scale.face)))
+
+    def loss(weights, key, batch, constants):
+        scale, hierarchy, tables, neutrals = constants
+        marks, start, target, owner = batch
+        found = residual.apply(
+            residual.Params(scale, weights, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
+        )
+        squared = jnp.sum(jnp.square((found - target) / scale.unit), axis=-1)
+        # Charbonnier: a distance, squared near zero.
+        value = jnp.mean(jnp.sqrt(squared + plan.soft**2))
+        return value, {"error_mm": scale.unit * jnp.mean(jnp.sqrt(squared))}
+
+    optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
+    indices = training.epoch_indices(seed, len(seen), plan.batch)
+
+    def batches(first: int, count: int):
+        rows = seen[indices(first, count).ravel()]
+        found = (*train.read(rows), answers[rows], train.owner[rows])
+        marks, target, start, owner = (x.reshape(count, plan.batch, *x.shape[1:]) for x in found)
+        return marks, start, target, owner
+
+    hierarchy = jax.device_put(hierarchy)
+    state = training.run(
+        steps.supervised(loss, optimiser),
+        steps.start_supervised(params.weights, optimiser, run_key),
+        batches,
+        folder,
+        steps=plan.steps,
+        constants=(scale, hierarchy, tables, jnp.asarray(data.neutral)),
+        chunk=25,
+    )
+    network = residual.Params(scale, state.params, jnp.ones(()))
+    fitted = Fitted(base.params, network, hierarchy, tables)
+    gate = _gate(fitted, train, answers, kept)
+    return fitted._replace(network=network._replace(gate=jnp.float32(gate)))
+
+
+def apply(fitted: Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    """Vertex displacements (T, N, 3) of one face (N, 3) from its landmarks' (T, L, 3)."""
+    base = np.asarray(linear.apply(gpmm.on_face(fitted.base, neutral), displacements))
+    return refine(fitted, displacements, base, np.broadcast_to(neutral, base.shape))
+
+
+def refine(fitted: Fitted, displacements: np.ndarray, base: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    """`apply` where the base's answers (T, N, 3) are there already; neutral faces (T, N, 3)."""
+    found = np.empty_like(base)
+    for low in range(0, len(base), BATCH):
+        some = slice(low, low + BATCH)
+        parts = [np.asarray(x[some], np.float32) for x in (displacements, base, neutral)]
+        # Filled up, so that the last batch compiles nothing new.
+        missing = BATCH - len(parts[0]) if len(base) > BATCH else 0
+        parts = [np.concatenate([x, x[:1].repeat(missing, axis=0)]) if missing else x for x in parts]
+        moved = residual.apply(fitted.network, fitted.hierarchy, fitted.tables, *parts)
+        found[some] = np.asarray(moved)[: len(base[some])]
+    return found
+
+
+def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
+    sums, squares, left, count = 0.0, 0.0, 0.0, 0
+    for marks, vertices in train:
+        left += np.sum(np.square(vertices - answers[count : count + len(vertices)], dtype=np.float64))
+        count += len(marks)
+        sums, squares = sums + marks.sum(axis=0, dtype=np.float64), squares + np.sum(np.square(marks, dtype=np.float64))
+    mean = sums / count
+    deviation = np.sqrt(max(squares / (count * mean.size) - np.mean(mean**2), 1e-12))
+    unit = max(np.sqrt(left / (count * face.size)), 1e-6)
+    return residual.Scale(*(jnp.asarray(x, jnp.float32) for x in (face, mean, deviation, unit)))
+
+
+def _gate(fitted: Fitted, train: Meshes, answers: np.ndarray, kept: np.ndarray) -> float:
+    """The share of the network's answer with the least error on meshes that it was not trained on."""
+    errors, count = np.zeros(len(GATES)), 0
+    for low in range(0, len(kept), 256):
+        rows = kept[low : low + 256 : 2]
+        marks, vertices = train.read(rows)
+        base = answers[rows]
+        whole = refine(fitted, marks, base, np.asarray(train.data.neutral)[train.owner[rows]]) - base
+        left = vertices - base
+        errors += [np.linalg.norm(left - gate * whole, axis=-1).mean(axis=-1).sum() for gate in GATES]
+        count += len(rows)
+    best = int(np.argmin(errors))
+    return GATES[best] if errors[best] < WORTH * errors[0] else 0.0

@@ -1,0 +1,63 @@
+"""What a displacement does to the skin locally: stretch at every vertex, and the frame to read it in.
+
+The Green strain of a displacement u on each triangle, E = 1/2 (G + G^T + G^T G) with G the gradient of u in the
+triangle's plane, symmetric and blind to rotation; averaged over the triangles about a vertex. N vertices, F
+triangles, B samples, W triangles at most about a vertex. Signals are (N, B, C), the batch inside, as
+`facejax.mesh.ops` wants them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Around(NamedTuple):
+    """The triangles, and which of them meet at each vertex."""
+
+    faces: np.ndarray  # (F, 3) int32
+    about: np.ndarray  # (N, W) int32; F marks an empty place
+    count: np.ndarray  # (N,) float32
+
+
+def around(faces: np.ndarray, count: int) -> Around:
+    """The tables of triangles (F, 3) on `count` vertices."""
+    owner = np.argsort(faces.ravel(), kind="stable")
+    vertex = faces.ravel()[owner]
+    sizes = np.bincount(vertex, minlength=count)
+    place = np.arange(len(vertex)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    about = np.full((count, sizes.max()), len(faces), np.int32)
+    about[vertex, place] = owner // 3
+    return Around(np.asarray(faces, np.int32), about, np.maximum(sizes, 1).astype(np.float32))
+
+
+@jax.jit
+def strain(displacements: jax.Array, neutral: jax.Array, tables: Around) -> tuple[jax.Array, jax.Array]:
+    """Strain (N, B, 6) and the neutral face's unit normals (N, B, 3), of (N, B, 3) and (N, B, 3).
+
+    Strain has no unit: 0.1 is a tenth longer; xx, yy, zz, xy, xz, yz in the axes of the mesh.
+    """
+    if displacements.shape != neutral.shape or neutral.shape[-1] != 3:
+        raise ValueError(f"expected two arrays (N, B, 3), got {displacements.shape} and {neutral.shape}")
+    a, b, c = (neutral[tables.faces[:, corner]] for corner in range(3))
+    moved = [displacements[tables.faces[:, corner]] for corner in range(3)]
+    first, second = b - a, c - a
+    normal = jnp.cross(first, second)
+    double = jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    normal = normal / double
+    # The dual basis of the two edges: G = du1 (x) dual1 + du2 (x) dual2.
+    duals = jnp.cross(second, normal) / double, jnp.cross(normal, first) / double
+    slope = sum(
+        (corner - moved[0])[..., :, None] * dual[..., None, :] for corner, dual in zip(moved[1:], duals, strict=True)
+    )
+    within = slope - normal[..., :, None] * jnp.sum(normal[..., :, None] * slope, axis=-2, keepdims=True)
+    squared = jnp.sum(slope[..., :, :, None] * slope[..., :, None, :], axis=-3)
+    green = 0.5 * (within + jnp.swapaxes(within, -1, -2) + squared)
+    six = [green[..., i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+    on_faces = jnp.concatenate([jnp.stack(six, axis=-1), normal], axis=-1)
+    padded = jnp.concatenate([on_faces, jnp.zeros_like(on_faces[:1])])
+    mean = padded[tables.about].sum(axis=1) / tables.count[:, None, None]
+    length = jnp.linalg.norm(mean[..., 6:], axis=-1, keepdims=True)
+    return mean[..., :6], mean[..., 6:] / jnp.maximum(length, 1e-12)
