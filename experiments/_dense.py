@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from facejax import evaluation, files, fit_decoder, fit_neural3dmm, fit_residual, methods
+from facejax import evaluation, files, fit_decoder, fit_neural3dmm, fit_residual, journal, methods
 from facejax.data import cache, makehuman, makehuman4d, performance, store
 from facejax.data.meshes import Meshes, of_split
 from facejax.mesh import graph, topology
@@ -83,11 +83,11 @@ def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
     the test subjects. Datasets of OT23 4.1 that have splits of their own get them (D3DFACS, Florence 4D, BU-3DFE).
     """
     known = [split for split in ("train", "validation") if len(data.subjects(split))]
-    people = _at_most(of_split(data, *known))
+    people = at_most(of_split(data, *known))
     found = []
     for split in splits:
         if split == "test":
-            found.append(Case("test", 0, people, _at_most(of_split(data, "test")), "subjects"))
+            found.append(Case("test", 0, people, at_most(of_split(data, "test")), "subjects"))
         elif split in ("identity", "expression"):
             found += _PUBLISHED.get(data.index.get("name"), _four_folds)(people, split)
         else:
@@ -140,7 +140,8 @@ def _first_of_each(people: Meshes, count: int) -> np.ndarray:
 _PUBLISHED = {"d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
 
 
-def _at_most(meshes: Meshes) -> Meshes:
+def at_most(meshes: Meshes) -> Meshes:
+    """The meshes, or a fixed draw of 20,000 of them."""
     if meshes.count <= MOST:
         return meshes
     keep = np.sort(np.random.default_rng(0).permutation(meshes.count)[:MOST])
@@ -189,44 +190,49 @@ def judge(
     regions: dict[str, np.ndarray],
     *,
     noises: Sequence[float] = (0.0,),
-    also: Callable[[Any], None] | None = None,
+    trained: str | None = None,
 ) -> dict[float, Result]:
-    """Fit a method to a case and measure it under each landmark noise (mm), or read what was measured before."""
-    folder = folder / name / case.name
+    """Fit a method to a case and measure it under each landmark noise (mm), or read what was measured before.
+
+    `trained` names the folder of checkpoints, where cases with the same training meshes share one.
+    """
+    kept = folder / name / case.name
+    folder = kept if trained is None else folder / name / trained
     key = _key(name, case, options, noises)
-    known = _read(folder, key, noises)
-    if known is not None and also is None:
+    known = _read(kept, key, noises)
+    if known is not None:
         return known
     method = methods.METHODS[name]
-    spent = folder / "seconds.json"
-    before = json.loads(spent.read_text()) if spent.exists() else 0.0
-    begun = time.perf_counter()
-    try:
-        if name in ("gpmm", "s2d_residual"):
-            options = options._replace(base=_base(case, options))
-        fitted = method.fit(case.train, folder, options)
-    finally:
-        # What an interrupted training took counts, too.
-        seconds = before + time.perf_counter() - begun
-        folder.mkdir(parents=True, exist_ok=True)
-        with files.replacing(spent) as temporary:
-            temporary.write_text(json.dumps(seconds))
-    if also is not None:
-        also(fitted)
     found = {}
+    model, seconds = _fit(name, case, folder, options)
     for noise in noises:
         distances = evaluation.distances(
-            lambda marks, rest: method.apply(fitted, marks, rest), case.test, regions, noise=noise
+            lambda marks, rest: method.apply(model, marks, rest), case.test, regions, noise=noise
         )
-        found[noise] = Result(distances, round(seconds, 1), _about(name, fitted, options))
-    _write(folder, key, found)
+        found[noise] = Result(distances, round(seconds, 1), _about(name, model, options))
+    _write(kept, key, found)
     return found
+
+
+def fitted(name: str, case: Case, folder: Path, options: methods.Options) -> Any:
+    """A method's parameters for a case: what was trained step by step in the folder of `judge` is not trained again."""
+    return _fit(name, case, folder / name / case.name, options)[0]
+
+
+def _fit(name: str, case: Case, folder: Path, options: methods.Options) -> tuple[Any, float]:
+    """Parameters, and the seconds that they took; of networks those of their steps, however often they were stopped."""
+    begun = time.perf_counter()
+    if name in ("gpmm", "s2d_residual"):
+        options = options._replace(base=base(case, options))
+    model = methods.METHODS[name].fit(case.train, folder, options)
+    steps = [entry["seconds"] for entry in journal.read(folder)]
+    return model, sum(steps) if steps else time.perf_counter() - begun
 
 
 _known_bases: dict[str, Any] = {}
 
 
-def _base(case: Case, options: methods.Options):
+def base(case: Case, options: methods.Options):
     """The morphable model of a case, which two methods share: the last one is kept, so judge one after the other."""
     key = _key("gpmm", case, options, ())
     if key not in _known_bases:
@@ -235,13 +241,13 @@ def _base(case: Case, options: methods.Options):
     return _known_bases[key]
 
 
-def _about(name: str, fitted: Any, options: methods.Options) -> dict[str, Any]:
-    if isinstance(fitted, methods.LinearFit):
-        return {"alpha_mm2": fitted.alpha}
+def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
+    if isinstance(model, methods.LinearFit):
+        return {"alpha_mm2": model.alpha}
     if name == "gpmm":
-        return fitted.params.prior._asdict()
+        return model.params.prior._asdict()
     if name == "s2d_residual":
-        return {**fitted.base.prior._asdict(), "gate": float(fitted.network.gate), "steps": options.residual.steps}
+        return {**model.base.prior._asdict(), "gate": float(model.network.gate), "steps": options.residual.steps}
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from facejax import fit_gpmm, journal, steps, training
+from facejax import fit_gpmm, journal, steps, training, weights
 from facejax.data.meshes import Meshes
 from facejax.mesh import strain
 from facejax.mesh.topology import Hierarchy
@@ -64,19 +64,23 @@ def fit(
     claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
     journal.claim(folder, claim)
     base = base or fit_gpmm.fit(train, by=by)
+    tables = jax.device_put(strain.around(np.asarray(data.faces), len(base.params.face)))
+    hierarchy = jax.device_put(hierarchy)
+    done = folder / "network.safetensors"
+    if done.exists():
+        return Fitted(base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables)
     answers = base.held_out(train)
     *_, (_, kept) = base.folds
     seen = np.setdiff1d(np.arange(train.count), kept)
     scale = _measure(train.where(np.isin(np.arange(train.count), seen)), answers[seen], base.params.face)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     params = residual.init(init_key, hierarchy, scale)
-    tables = jax.device_put(strain.around(np.asarray(data.faces), len(scale.face)))
 
-    def loss(weights, key, batch, constants):
+    def loss(trained, key, batch, constants):
         scale, hierarchy, tables, neutrals = constants
         marks, start, target, owner = batch
         found = residual.apply(
-            residual.Params(scale, weights, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
+            residual.Params(scale, trained, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
         )
         squared = jnp.sum(jnp.square((found - target) / scale.unit), axis=-1)
         # Charbonnier: a distance, squared near zero.
@@ -92,7 +96,6 @@ def fit(
         marks, target, start, owner = (x.reshape(count, plan.batch, *x.shape[1:]) for x in found)
         return marks, start, target, owner
 
-    hierarchy = jax.device_put(hierarchy)
     state = training.run(
         steps.supervised(loss, optimiser),
         steps.start_supervised(params.weights, optimiser, run_key),
@@ -104,8 +107,16 @@ def fit(
     )
     network = residual.Params(scale, state.params, jnp.ones(()))
     fitted = Fitted(base.params, network, hierarchy, tables)
-    gate = _gate(fitted, train, answers, kept)
-    return fitted._replace(network=network._replace(gate=jnp.float32(gate)))
+    network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
+    # What was judged is kept: the answers that it was judged by take a minute to come by.
+    weights.save(done, network._asdict())
+    return fitted._replace(network=network)
+
+
+def _load(path: Path, hierarchy: Hierarchy, base: gpmm.Params, landmarks: int) -> residual.Params:
+    blank = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.ones(()))
+    like = jax.eval_shape(lambda key: residual.init(key, hierarchy, blank), jax.random.key(0))
+    return residual.Params(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
 
 
 def apply(fitted: Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:

@@ -56,6 +56,12 @@ class Meshes:
         return self.data.row_labels()[self.data.drawn[self.at]]
 
     @property
+    def recordings(self) -> np.ndarray:
+        """The number of each mesh's recording, (G,)."""
+        counts = [s.frames for s in self.data.sequences]
+        return np.repeat(np.arange(len(counts)), counts)[self.data.drawn[self.at]]
+
+    @property
     def subjects(self) -> np.ndarray:
         """Whose meshes there are, in order."""
         return np.unique(self.owner)

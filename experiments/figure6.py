@@ -1,0 +1,124 @@
+"""Where each method errs: heat maps on rendered faces. OT23, figure 6.
+
+    python -m experiments.figure6 --publish
+
+The first fold of people of `experiments.table1`, whose folder is read for what was trained there. For each face
+shown, the frame with the strongest motion of its expression; blue is no error, red the same distance for all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from experiments import _dense, _run
+from facejax import files, methods
+from facejax.io import render
+
+METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "neural3dmm", "s2d", "gpmm", "s2d_residual")
+SHOWN = ("high_smile", "mouth_extreme", "eyebrow", "mouth_side")  # one on each of as many people
+HIGH = 0.4  # mm
+PICTURE = (170, 214)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    out: Path = Path("runs/figure6")
+    """Folder for the results."""
+    runs: Path = Path("runs/table1")
+    """Folder of `experiments.table1`."""
+    seed: int = 0
+    """Of the networks."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d."""
+    level: int = 3
+    """Realism of makehuman4d."""
+    methods: tuple[str, ...] = METHODS
+    """Which methods."""
+    high: float = HIGH
+    """What is drawn red, mm."""
+    quick: bool = False
+    """A look: a small dataset and few steps."""
+    paper: bool = False
+    """Trained for the paper's 300 epochs."""
+    publish: bool = False
+    """Also write the picture that the README shows."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """A sheet: one row per face, the truth and then each method; and each one's mean error."""
+    mode, begun = _dense.mode_of(config), time.perf_counter()
+    _dense.check_methods(config.methods)
+    data = _dense.data_of(config.data, mode, level=config.level)
+    case = _dense.cases(data, ["identity"])[0]
+    options = _dense.options_of(case, mode, config.seed, _dense.hierarchy_of(data))
+    chosen = _strongest(case.test)
+    true = [_true(case.test, row) for row in chosen]
+    columns = [[_face(data, vertices) for vertices in true]]
+    rows = []
+    for name in config.methods:
+        fitted = _dense.fitted(name, case, config.runs, options)
+        column = []
+        for row, vertices in zip(chosen, true, strict=True):
+            rest = np.asarray(data.neutral[case.test.owner[row]])
+            marks = case.test.read(np.array([row]))[0]
+            made = methods.METHODS[name].apply(fitted, marks, rest)[0]
+            error = np.linalg.norm(made - vertices, axis=-1)
+            column.append(_face(data, made, render.heat(error, high=config.high)))
+            rows.append({"method": name, "label": str(case.test.labels[row]), "mean_mm": float(error.mean()),
+                         "largest_mm": float(error.max())})  # fmt: skip
+        columns.append(column)
+    sheet = render.contact_sheet(
+        [list(line) for line in zip(*columns, strict=True)],
+        row_labels=[str(case.test.labels[row]) for row in chosen],
+        column_labels=["true", *(_dense.NAMES[name] for name in config.methods)],
+    )
+    path = config.out / "figure6.png"
+    with files.replacing(path) as temporary:
+        Image.fromarray(sheet).save(temporary)
+    made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
+    metrics = {"mode": mode, "red_mm": config.high, "rows": rows}
+    _run.finish("figure6", config, metrics, made=made, table=_table(rows, config), figure=path)
+    return metrics
+
+
+def _strongest(test) -> list[int]:
+    """For each expression shown, of another person each time, the frame that moves most."""
+    moved = np.concatenate([np.linalg.norm(vertices, axis=-1).mean(axis=1) for _, vertices in test])
+    labels = [label for label in SHOWN if label in test.labels] or list(np.unique(test.labels)[: len(SHOWN)])
+    found = []
+    for i, label in enumerate(labels):
+        whose = test.subjects[i % len(test.subjects)]
+        mine = np.flatnonzero((test.labels == label) & (test.owner == whose))
+        mine = mine if len(mine) else np.flatnonzero(test.labels == label)
+        found.append(int(mine[np.argmax(moved[mine])]))
+    return found
+
+
+def _true(test, row: int) -> np.ndarray:
+    return test.read(np.array([row]))[1][0] + np.asarray(test.data.neutral[test.owner[row]])
+
+
+def _face(data, vertices: np.ndarray, colours: np.ndarray | None = None) -> np.ndarray:
+    camera = render.aim(vertices * 1.05, size=PICTURE, turn=18)
+    look = {} if colours is None else {"colours": colours}
+    return render.image(vertices, np.asarray(data.faces), size=PICTURE, camera=camera, **look)
+
+
+def _table(rows, config: Config) -> str:
+    labels = list(dict.fromkeys(row["label"] for row in rows))
+    body = []
+    for name in config.methods:
+        mine = {row["label"]: row for row in rows if row["method"] == name}
+        cells = ["{mean_mm:.4f} / {largest_mm:.2f}".format(**mine[label]) for label in labels]
+        body.append((_dense.NAMES[name], *cells))
+    return _run.markdown(("mm, mean / largest", *labels), body)
+
+
+if __name__ == "__main__":
+    _run.main("figure6", Config, run)

@@ -1,0 +1,204 @@
+"""When does a spiral decoder pay, and by how much? Every rung of realism, with and without noise.
+
+    python -m experiments.nonlinearity --publish
+
+makehuman4d's levels 0 (exactly linear) to 3 (jaw, saturation, contact, wrinkles), as made and with smooth
+registration noise of 0.3 mm; landmarks at test time as they are, and off by 0.5 and 1 mm as a detector would have
+them. Held-out people (80 train, 20 test) and held-out expressions (the first of four folds). `told` is the morphable
+model that knows how noisy the landmarks are. The floor is what the landmarks leave open (`facejax.floor`): for
+whoever sees landmarks alone, and for whoever sees the person's face as well.
+
+`--quick` is a look, minutes; `--paper` trains for 300 epochs. About four hours on 2 cores, most of them for S2D-Dec;
+a stopped run goes on. `--levels`, `--noises` and `--methods` pick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from experiments import _dense, _run
+from facejax import evaluation, fit_decoder, floor, methods
+from facejax.data import rig
+from facejax.models import gpmm, linear
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+METHODS = ("ridge", "pca220", "rbf", "gpmm", "s2d_residual", "s2d")
+LANDMARK_NOISE = (0.0, 0.5, 1.0)  # mm
+COLOURS = {"ridge": "#c46b4e", "pca220": "#5b8db8", "rbf": "#999999", "gpmm": "#6a9a58", "told": "#9bc48a",
+           "s2d_residual": "#222222", "s2d": "#b08cc0"}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    out: Path = Path("runs/nonlinearity")
+    """Folder for checkpoints and results."""
+    seed: int = 0
+    """Of the networks."""
+    levels: tuple[int, ...] = rig.LEVELS
+    """Levels of realism."""
+    noises: tuple[float, ...] = (0.0, 0.3)
+    """Registration noise of the meshes, mm."""
+    methods: tuple[str, ...] = METHODS
+    """Which methods."""
+    splits: tuple[str, ...] = ("test", "expression")
+    """Held-out people, held-out expressions."""
+    steps: int = 6_000
+    """Of S2D-Dec."""
+    quick: bool = False
+    """A look: small datasets and few steps."""
+    paper: bool = False
+    """Train for the paper's 300 epochs."""
+    publish: bool = False
+    """Also write the figures that the README quotes."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """One row per level, registration noise, landmark noise, split, method and region."""
+    mode = _dense.mode_of(config)
+    _dense.check_methods(config.methods)
+    rows, floors, seconds = [], [], 0.0
+    for noise in config.noises:
+        for level in config.levels:
+            data = _dense.data_of(None, mode, level=level, noise=noise)
+            regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
+            for split in config.splits:
+                case = _dense.cases(data, [split])[0]
+                where = {"level": level, "noise_mm": noise, "split": split}
+                plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
+                options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
+                folder = config.out / f"level{level}-noise{noise:g}"
+                for name in config.methods:
+                    begun = time.perf_counter()
+                    found = _dense.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)
+                    rows += _rows(where, name, found, regions)
+                    seconds += found[0.0].seconds
+                    shown = ", ".join(f"{r.distances.mean_std(regions['head'])[0]:.4f}" for r in found.values())
+                    print(f"{where} {name}: {shown} mm, {time.perf_counter() - begun:.0f} s", flush=True)
+                told, line = _told_and_floor(case, folder, options, regions)
+                rows += _rows(where, "told", told, regions)
+                floors.append(where | line)
+    made = _run.record(config, seconds=seconds, dataset=data.index["spec"] | {"level": list(config.levels)})
+    metrics = {"mode": mode, "rows": rows, "floor": floors}
+    figure = _plot(config.out / "nonlinearity.png", rows, floors, config)
+    table = _table(rows, floors, config)
+    _run.finish("nonlinearity", config, metrics, made=made, table=table, figure=figure)
+    return metrics
+
+
+def _rows(where: dict[str, Any], name: str, found: dict, regions: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    rows = []
+    for landmark_noise, result in found.items():
+        for region, mask in regions.items():
+            mean, std = result.distances.mean_std(mask)
+            row = {"method": name, "landmark_noise_mm": landmark_noise, "region": region}
+            rows.append(where | row | {"mean_mm": mean, "std_mm": std, "chosen": result.about})
+    return rows
+
+
+def _told_and_floor(case, folder: Path, options: methods.Options, regions: dict[str, np.ndarray]):
+    """The morphable model under each landmark noise that it is told, and the two floors."""
+    fitted = _dense.base(case, options)
+    told = {}
+    for noise in LANDMARK_NOISE:
+        params = fitted.params._replace(prior=fitted.params.prior._replace(noise=fitted.params.prior.noise + noise**2))
+        distances = evaluation.distances(
+            lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.on_face(p, rest), marks)),
+            case.test, regions, noise=noise,
+        )  # fmt: skip
+        told[noise] = _dense.Result(distances, 0.0, {})
+    ridge = methods.METHODS["ridge"].fit(case.train, folder, options).params
+    return told, _floors(case, fitted.params, ridge, regions)
+
+
+def _floors(case, base: gpmm.Params, ridge: linear.Params, regions: dict[str, np.ndarray]) -> dict[str, Any]:
+    test = case.test.thin(max(1, case.test.count // 2_000))
+    marks, vertices = (np.concatenate(part) for part in zip(*test, strict=True))
+    recording = test.recordings
+    alone = vertices - np.asarray(linear.apply(ridge, marks))
+    with_face = np.empty_like(vertices)
+    for subject in test.subjects:
+        mine = test.owner == subject
+        one = gpmm.on_face(base, test.data.neutral[subject])
+        with_face[mine] = vertices[mine] - np.asarray(linear.apply(one, marks[mine]))
+    found = {
+        "landmarks": floor.estimate(alone, *floor.pairs(marks, test.owner)),
+        "landmarks and face": floor.estimate(with_face, *floor.pairs(marks, test.owner, apart=recording, alike=True)),
+    }
+    return {
+        name: {region: float(line[mask].mean()) for region, mask in regions.items()} for name, line in found.items()
+    }
+
+
+def _value(rows, **key) -> float:
+    return next((r["mean_mm"] for r in rows if all(r[name] == wanted for name, wanted in key.items())), np.nan)
+
+
+def _table(rows, floors, config: Config) -> str:
+    names = (*config.methods, "told")
+    parts = []
+    for split in config.splits:
+        body = []
+        for noise in config.noises:
+            for level in config.levels:
+                for off in LANDMARK_NOISE:
+                    key = {"level": level, "noise_mm": noise, "split": split, "landmark_noise_mm": off}
+                    cells = [
+                        "{:.4f} / {:.4f}".format(
+                            *(_value(rows, method=name, region=region, **key) for region in ("head", "face"))
+                        )
+                        for name in names
+                    ]
+                    line = next(f for f in floors if (f["level"], f["noise_mm"], f["split"]) == (level, noise, split))
+                    known = [f"{line[what]['head']:.4f}" for what in ("landmarks", "landmarks and face")]
+                    body.append((f"{level}, {noise:g}, {off:g}", *cells, *(known if off == 0 else ("", ""))))
+        header = ["level, registration noise, landmark noise"]
+        header += [_dense.NAMES.get(name, "GPMM, told") for name in names]
+        header += ["floor: landmarks", "floor: with the face"]
+        title = "Held-out people" if split == "test" else "Held-out expressions"
+        parts.append(f"{title}, mean vertex error in mm, head / face:\n\n{_run.markdown(header, body)}")
+    return "\n\n".join(parts)
+
+
+def _plot(path: Path, rows, floors, config: Config) -> Path:
+    size = (8.4 * len(config.noises), 4.2 * len(config.splits))
+    figure, axes = plt.subplots(
+        len(config.splits), 2 * len(config.noises), figsize=size, constrained_layout=True, squeeze=False
+    )
+    for line, split in zip(axes, config.splits, strict=True):
+        for i, noise in enumerate(config.noises):
+            for j, off in enumerate((LANDMARK_NOISE[0], LANDMARK_NOISE[-1])):
+                axis = line[2 * i + j]
+                for name in (*config.methods, "told"):
+                    values = [
+                        _value(rows, level=level, noise_mm=noise, split=split, landmark_noise_mm=off, method=name,
+                               region="face")
+                        for level in config.levels
+                    ]  # fmt: skip
+                    label = _dense.NAMES.get(name, "GPMM, told")
+                    shown = {"label": label, "color": COLOURS.get(name)}
+                    axis.plot(config.levels, np.maximum(values, 1e-5), marker="o", ms=3, **shown)
+                for what, style in (("landmarks", ":"), ("landmarks and face", "--")):
+                    some = [f for f in floors if (f["noise_mm"], f["split"]) == (noise, split)]
+                    values = [f[what]["face"] for f in sorted(some, key=lambda f: f["level"])]
+                    axis.plot(config.levels, np.maximum(values, 1e-5), style, color="0.5", label=f"floor: {what}")
+                axis.set(title=f"{split}: registration noise {noise:g}, landmarks off by {off:g} mm", yscale="log",
+                         xlabel="level of realism", xticks=config.levels)  # fmt: skip
+                axis.title.set_fontsize(9)
+        line[0].set_ylabel("mean vertex error of the face, mm")
+    axes[0, 0].legend(frameon=False, fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+    return path
+
+
+if __name__ == "__main__":
+    _run.main("nonlinearity", Config, run)
