@@ -16,36 +16,25 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from facejax import fit_gpmm, journal, steps, training, weights
+from facejax import expand, fit_gpmm, journal, steps, training, weights
 from facejax.data.meshes import Meshes
 from facejax.mesh import strain
 from facejax.mesh.topology import Hierarchy
-from facejax.models import gpmm, linear, residual
+from facejax.models import gpmm, residual
 
 GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
 WORTH = 0.995  # a gate that is not 0 has to be better by half a hundredth
-BATCH = 16
 
 
 class Plan(NamedTuple):
     """How the network is trained."""
 
     steps: int = 2_500
-    batch: int = BATCH
+    batch: int = 16
     rate: float = 2e-3  # decays to zero along a cosine
     weight_decay: float = 1e-4
-    soft: float = (
-        0.1  # of the unit: below it the loss is squared. Wrinkles are sparse, and an absolute loss predicts none
-    )
-
-
-class Fitted(NamedTuple):
-    """Everything that `apply` needs."""
-
-    base: gpmm.Params
-    network: residual.Params
-    hierarchy: Hierarchy
-    tables: strain.Around
+    # Of the unit: below it the loss is squared. Wrinkles are sparse, and an absolute loss predicts none.
+    soft: float = 0.1
 
 
 def fit(
@@ -57,7 +46,7 @@ def fit(
     by: str = "subjects",
     seed: int = 0,
     base: fit_gpmm.Fitted | None = None,
-) -> Fitted:
+) -> expand.Params:
     """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit."""
     folder, data = Path(folder), train.data
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
@@ -68,7 +57,9 @@ def fit(
     hierarchy = jax.device_put(hierarchy)
     done = folder / "network.safetensors"
     if done.exists():
-        return Fitted(base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables)
+        return expand.Params(
+            base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables
+        )
     answers = base.held_out(train)
     *_, (_, kept) = base.folds
     seen = np.setdiff1d(np.arange(train.count), kept)
@@ -106,7 +97,7 @@ def fit(
         chunk=25,
     )
     network = residual.Params(scale, state.params, jnp.ones(()))
-    fitted = Fitted(base.params, network, hierarchy, tables)
+    fitted = expand.Params(base.params, network, hierarchy, tables)
     network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
     # What was judged is kept: the answers that it was judged by take a minute to come by.
     weights.save(done, network._asdict())
@@ -117,26 +108,6 @@ def _load(path: Path, hierarchy: Hierarchy, base: gpmm.Params, landmarks: int) -
     blank = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.ones(()))
     like = jax.eval_shape(lambda key: residual.init(key, hierarchy, blank), jax.random.key(0))
     return residual.Params(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
-
-
-def apply(fitted: Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """Vertex displacements (T, N, 3) of one face (N, 3) from its landmarks' (T, L, 3)."""
-    base = np.asarray(linear.apply(gpmm.on_face(fitted.base, neutral), displacements))
-    return refine(fitted, displacements, base, np.broadcast_to(neutral, base.shape))
-
-
-def refine(fitted: Fitted, displacements: np.ndarray, base: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """`apply` where the base's answers (T, N, 3) are there already; neutral faces (T, N, 3)."""
-    found = np.empty_like(base)
-    for low in range(0, len(base), BATCH):
-        some = slice(low, low + BATCH)
-        parts = [np.asarray(x[some], np.float32) for x in (displacements, base, neutral)]
-        # Filled up, so that the last batch compiles nothing new.
-        missing = BATCH - len(parts[0]) if len(base) > BATCH else 0
-        parts = [np.concatenate([x, x[:1].repeat(missing, axis=0)]) if missing else x for x in parts]
-        moved = residual.apply(fitted.network, fitted.hierarchy, fitted.tables, *parts)
-        found[some] = np.asarray(moved)[: len(base[some])]
-    return found
 
 
 def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
@@ -151,14 +122,15 @@ def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.S
     return residual.Scale(*(jnp.asarray(x, jnp.float32) for x in (face, mean, deviation, unit)))
 
 
-def _gate(fitted: Fitted, train: Meshes, answers: np.ndarray, kept: np.ndarray) -> float:
+def _gate(fitted: expand.Params, train: Meshes, answers: np.ndarray, kept: np.ndarray) -> float:
     """The share of the network's answer with the least error on meshes that it was not trained on."""
     errors, count = np.zeros(len(GATES)), 0
     for low in range(0, len(kept), 256):
         rows = kept[low : low + 256 : 2]
         marks, vertices = train.read(rows)
         base = answers[rows]
-        whole = refine(fitted, marks, base, np.asarray(train.data.neutral)[train.owner[rows]]) - base
+        rest = np.asarray(train.data.neutral)[train.owner[rows]]
+        whole = np.asarray(expand.refine(fitted, marks, base, rest)) - base
         left = vertices - base
         errors += [np.linalg.norm(left - gate * whole, axis=-1).mean(axis=-1).sum() for gate in GATES]
         count += len(rows)

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from facejax import evaluation, fit_decoder, fit_gpmm, fit_neural3dmm, fit_residual
+from facejax import evaluation, expand, fit_decoder, fit_gpmm, fit_neural3dmm, fit_residual
 from facejax.data.meshes import Meshes
 from facejax.geometry import rbf
 from facejax.mesh import attachment, topology
@@ -141,15 +141,15 @@ def _apply_gpmm(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.
     return neutral + np.asarray(linear.apply(gpmm.on_face(fitted.params, neutral), displacements))
 
 
-def _fit_residual(train: Meshes, folder: Path, options: Options) -> fit_residual.Fitted:
+def _fit_residual(train: Meshes, folder: Path, options: Options) -> expand.Params:
     return fit_residual.fit(
         train, _hierarchy(train, options), folder, plan=options.residual, by=options.by, seed=options.seed,
         base=_fit_gpmm(train, folder, options),
     )  # fmt: skip
 
 
-def _apply_residual(fitted: fit_residual.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    return neutral + fit_residual.apply(fitted, displacements, neutral)
+def _apply_residual(fitted: expand.Params, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + np.asarray(expand.apply(fitted, displacements, neutral))
 
 
 def _fit_neural(train: Meshes, folder: Path, options: Options) -> fit_neural3dmm.Fitted:

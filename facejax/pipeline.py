@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from facejax import composition, weights
+from facejax import composition, expand, weights
 from facejax.io import dress
 from facejax.mesh import topology
 from facejax.models import charts, decoder, generators, starts
@@ -28,6 +28,8 @@ from facejax.models import charts, decoder, generators, starts
 RATE = 30.0  # frames per second at which motions are played
 FRAMES = 30  # of a transition, as the generator learnt them
 RELEASED = "makehuman4d.safetensors"
+S2D, REFINED = "s2d", "refined"  # kinds of decoder
+COMPONENTS = 200  # of the best linear answer, in a file: as many more gain 0.001 mm, and weigh 4 MB
 
 
 class Face(NamedTuple):
@@ -48,8 +50,8 @@ class Models(NamedTuple):
     props: dress.Props  # eyes and teeth of the template, for pictures; without landmarks: none
     motion: generators.Params
     starts: starts.Params  # peaks from which a motion starts that does not start at neutral
-    hierarchy: Any
-    decoder: Any
+    hierarchy: topology.Hierarchy
+    decoder: decoder.Params | expand.Params  # S2D-Dec, or the best linear answer refined
     about: dict[str, Any]  # how the weights were made
 
 
@@ -64,18 +66,26 @@ def load(path: str | os.PathLike | None = None) -> Models:
     tree, about = weights.load(path, like)
     try:
         tree["hierarchy"] = topology.load(tree["hierarchy"])
-    except ValueError as error:
+        if about.get("decoder", S2D) == REFINED:
+            tree["decoder"] = expand.unpack(tree["decoder"], tree["hierarchy"], tree["face"].faces)
+    except (ValueError, KeyError) as error:
         raise weights.WeightsError(f"{path}: {error}") from error
     # The face and its props stay on the host: they are read by exporters, not by networks.
-    moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in ("motion", "starts", "hierarchy", "decoder")}
+    networks = ["motion", "starts", "hierarchy"]
+    networks += ["decoder"] if isinstance(tree["decoder"], decoder.Params) else []
+    moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in networks}
     return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
 
 
 def save(path: str | os.PathLike, models: Models) -> None:
     """Write models to one safetensors file; `about` gains what `load` needs."""
     tree = models._asdict()
+    refined = isinstance(models.decoder, expand.Params)
     about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
+    about["decoder"] = REFINED if refined else S2D
     tree["hierarchy"] = topology.save(models.hierarchy)
+    if refined:
+        tree["decoder"] = expand.pack(models.decoder, components=COMPONENTS)
     leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
     weights.save(path, tree, metadata=about | {"shapes": leaves})
 
@@ -144,6 +154,8 @@ def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
         raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
+    if isinstance(models.decoder, expand.Params):
+        return jnp.asarray(neutral, jnp.float32) + expand.apply(models.decoder, landmarks - rest, neutral)
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 
 
@@ -215,18 +227,24 @@ def _structure(shapes: dict[str, list], generator: str) -> dict[str, Any]:
     tables = {f"{table}/{i}": leaf for table, rows in nested["hierarchy"].items() for i, leaf in rows.items()}
     networks = {}
     for name in ("motion", "decoder"):
-        weights = nested[name]["weights"]
-        lists = ("blocks", "gates", "convs")
-        networks[name] = weights | {key: _listed(weights[key]) for key in lists if key in weights}
+        networks[name] = _listed(nested[name].get("weights", {}))
     return {
         "face": Face(**nested["face"]),
         "props": dress.Props(**nested["props"]),
         "motion": generators.KINDS[generator](charts.Chart(**nested["motion"]["chart"]), networks["motion"]),
         "starts": starts.Params(**nested["starts"]),
         "hierarchy": tables,
-        "decoder": decoder.Params(decoder.Scale(**nested["decoder"]["scale"]), networks["decoder"]),
+        "decoder": (
+            _listed(nested["decoder"])
+            if "base" in nested["decoder"]
+            else decoder.Params(decoder.Scale(**nested["decoder"]["scale"]), networks["decoder"])
+        ),
     }
 
 
-def _listed(rows: dict[str, Any]) -> list:
-    return [rows[str(i)] for i in range(len(rows))]
+def _listed(tree: Any) -> Any:
+    """A nested dict whose numbered entries, "0" to the last, are lists again."""
+    if not isinstance(tree, dict):
+        return tree
+    rows = {name: _listed(rows) for name, rows in tree.items()}
+    return [rows[str(i)] for i in range(len(rows))] if "0" in rows else rows

@@ -1,0 +1,134 @@
+"""From the landmarks of one face to its mesh: the best linear answer, refined by a spiral decoder.
+
+    vertices = neutral + expand.apply(params, landmark_displacements, neutral)
+
+What the linear answer has to know of a face is worked out once, on the host, and remembered for the last few faces:
+half a second each. `pack` and `unpack` are for files. N vertices, L landmarks, k components; millimetres.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections import OrderedDict
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from facejax.mesh import strain
+from facejax.mesh.topology import Hierarchy
+from facejax.models import gpmm, linear, residual
+
+BATCH = 16
+FACES = 8  # remembered
+_prepared: OrderedDict[tuple[int, str], linear.Params] = OrderedDict()
+
+
+class Params(NamedTuple):
+    """The linear answer, the network that refines it, and the tables that it works on."""
+
+    base: gpmm.Params
+    network: residual.Params
+    hierarchy: Hierarchy
+    tables: strain.Around
+
+
+def apply(params: Params, displacements: jax.Array, neutral: np.ndarray) -> jax.Array:
+    """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
+
+    Raises `ValueError` for other shapes, and for a face that is traced: each is prepared on the host.
+    """
+    if isinstance(neutral, jax.core.Tracer):
+        raise ValueError(
+            "neutral: every face is prepared on the host, so that it cannot be traced: leave it out of jit"
+        )
+    base = linear.apply(on_face(params.base, np.asarray(neutral)), jnp.asarray(displacements))
+    lead = base.shape[:-2]
+    flat = base.reshape(-1, *base.shape[-2:])
+    marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), -1, 3)
+    rest = jnp.broadcast_to(jnp.asarray(neutral, jnp.float32), flat.shape)
+    return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
+
+
+def on_face(base: gpmm.Params, neutral: np.ndarray) -> linear.Params:
+    """`gpmm.on_face`, remembered."""
+    key = id(base.statistics), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest()
+    if key not in _prepared:
+        _prepared[key] = gpmm.on_face(base, neutral)
+        while len(_prepared) > FACES:
+            _prepared.popitem(last=False)
+    _prepared.move_to_end(key)
+    return _prepared[key]
+
+
+def refine(params: Params, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:
+    """The base's answers (B, N, 3) to landmarks (B, L, 3) of faces (B, N, 3), refined."""
+    if len(base) == 0 or float(params.network.gate) == 0:
+        return base
+    return _refine(params.network, params.hierarchy, params.tables, displacements, base, neutral)
+
+
+@jax.jit
+def _refine(network, hierarchy, tables, displacements, base, neutral):
+    """In equal pieces of at most 16, one after another, so that temporary arrays stay small."""
+    count = len(base)
+    pieces = -(-count // BATCH)
+    size = -(-count // pieces)
+    parts = [
+        jnp.pad(x, ((0, pieces * size - count), (0, 0), (0, 0)), mode="edge").reshape(pieces, size, *x.shape[1:])
+        for x in (displacements, base, neutral)
+    ]
+    found = jax.lax.map(lambda part: residual.apply(network, hierarchy, tables, *part), tuple(parts))
+    return found.reshape(-1, *found.shape[2:])[:count]
+
+
+def pack(params: Params, *, components: int | None = None) -> dict[str, Any]:
+    """A tree of arrays for a file: the widest `components`, in half precision, an error of some 0.0005 mm."""
+    base = params.base
+    tree = {name: np.asarray(getattr(base, name), np.float32) for name in ("face", "motion", "hold")}
+    tree |= {"landmark_index": np.asarray(base.landmark_index, np.int32), "prior": np.array(base.prior, np.float64)}
+    known = base.statistics
+    if isinstance(known, linear.Basis):
+        some = slice(components)
+        tree["mean"] = np.asarray(known.vertex_mean, np.float32)
+        tree["components"] = np.asarray(known.components[some], np.float16)
+        tree["variance"] = np.asarray(known.variance[some], np.float32)
+    else:
+        means = {"mean": known.vertex_mean, "landmark_mean": known.landmark_mean, "within": known.covariance}
+        tree |= {name: np.asarray(x, np.float32) for name, x in means.items()}
+        tree["cross"] = np.asarray(known.cross, np.float16)
+    return {"base": tree, "network": params.network._asdict()}
+
+
+def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: np.ndarray) -> Params:
+    """What `pack` was given, on the triangles (F, 3). Raises `KeyError` for a tree that is none of its own."""
+    base = dict(tree["base"])
+    at, prior = np.asarray(base["landmark_index"]), np.asarray(base["prior"])
+    wide = functools.partial(np.asarray, dtype=np.float64)
+    if "components" in base:
+        components = wide(base["components"])
+        marks = components.reshape(len(components), -1, 3)[:, at].reshape(len(components), -1)
+        mean = wide(base["mean"])
+        variance = wide(base["variance"])
+        known = linear.Basis(mean[at], mean, components, marks, variance, float(variance.sum()))
+    else:
+        known = linear.Moments(*(wide(base[name]) for name in ("landmark_mean", "mean", "within", "cross")))
+    prior = gpmm.Prior(bool(prior[0]), float(prior[1]), float(prior[2]))
+    face, motion, hold = (wide(base[name]) for name in ("face", "motion", "hold"))
+    faces = np.asarray(faces)
+    found = gpmm.Params(faces, at, face, motion, hold, known, prior)
+    network = tree["network"]
+    return Params(
+        found,
+        jax.tree.map(jnp.asarray, _network(network)),
+        jax.device_put(hierarchy),
+        jax.device_put(strain.around(faces, len(face))),
+    )
+
+
+def _network(tree: dict[str, Any]) -> residual.Params:
+    scale = tree["scale"]
+    scale = residual.Scale(**scale) if isinstance(scale, dict) else residual.Scale(*scale)
+    return residual.Params(scale, tree["weights"], tree["gate"])
