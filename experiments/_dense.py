@@ -23,6 +23,8 @@ from facejax.mesh import graph, topology
 MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
 FACE_REACH = 25.0  # mm along the surface
 FOLDS = 4
+QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
+QUICK_STEPS, QUICK_COMPONENTS = 100, 60
 Mode = Literal["quick", "default", "paper"]
 NAMES = {
     "s2d": "S2D-Dec",
@@ -66,7 +68,7 @@ def data_of(path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0
     """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
     if path is not None:
         return store.open_store(path)
-    size = {"subjects": 24, "meshes": 1_200} if mode == "quick" else {}
+    size = QUICK if mode == "quick" else {}
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
 
@@ -177,9 +179,9 @@ def options_of(case: Case, mode: Mode, seed: int, hierarchy: topology.Hierarchy,
     }  # fmt: skip
     for name, plan in steps.items():
         chosen = plan()
-        count = 100 if mode == "quick" else -(-epochs // chosen.batch)
+        count = QUICK_STEPS if mode == "quick" else -(-epochs // chosen.batch)
         options = options._replace(**{name: chosen._replace(steps=count)})
-    return (options._replace(components=60) if mode == "quick" else options)._replace(**plans)
+    return (options._replace(components=QUICK_COMPONENTS) if mode == "quick" else options)._replace(**plans)
 
 
 def judge(

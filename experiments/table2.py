@@ -22,11 +22,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _dense, _run, _transferred
 from facejax import drive, methods
 from facejax.data import livelink, makehuman, makehuman4d, performance
 from facejax.data.meshes import of_split
-from facejax.geometry import srvf
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -80,7 +79,7 @@ def run(config: Config) -> dict[str, Any]:
         for index in others:
             rest = faces[index].vertices
             for take, true in zip(moved[source], moved[index], strict=True):
-                marks = {"transferred": _transfer(take, faces[source].vertices, rest, data.landmark_index),
+                marks = {"transferred": _transferred.transfer(take, faces[source].vertices, rest, data.landmark_index),
                          "own": (true - rest)[:, data.landmark_index]}  # fmt: skip
                 for what, landmarks in marks.items():
                     made = methods.METHODS[name].apply(fitted, landmarks.astype(np.float32), rest)
@@ -108,18 +107,6 @@ def _passages(config: Config) -> list[livelink.Recording]:
 
 def _skin(take: livelink.Recording, person: makehuman.Subject) -> np.ndarray:
     return drive.posed(take, person)[:, : len(person.vertices)]
-
-
-def _transfer(moved: np.ndarray, source: np.ndarray, target: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """The source's landmark motion (T, L, 3) on the target, through its SRVF: displacements from the target's neutral.
-
-    A passage starts anywhere, so that it is displacements that are carried: the first one scaled to the face, and the
-    motion from there on by its point on the sphere and its length.
-    """
-    sizes = [np.linalg.norm(face[index] - face[index].mean(axis=0)) for face in (source, target)]
-    unitless = ((moved - source)[:, index] / sizes[0]).astype(np.float32)
-    q, log_length = srvf.encode(unitless)
-    return np.asarray(srvf.decode(q, log_length, unitless[0])) * sizes[1]
 
 
 def _errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:

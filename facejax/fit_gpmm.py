@@ -60,8 +60,11 @@ def fit(
     The folds are fitted to every second mesh, with fewer components: they decide, and serve the training of what comes
     after.
     """
-    of = train.owner if by == "subjects" else train.labels
-    held = [np.flatnonzero(np.isin(of, group)) for group in np.array_split(np.unique(of), FOLDS)]
+    of = train.groups(by)
+    names = np.unique(of)
+    if len(names) < 2:
+        raise ValueError(f"expected meshes of two or more {by}, got {len(names)}")
+    held = [np.flatnonzero(np.isin(of, part)) for part in np.array_split(names, min(FOLDS, len(names)))]
     faces, at = np.asarray(train.data.faces), np.asarray(train.data.landmark_index)
     face, hold = gpmm.survey(_People(train))
     errors, models, learnt = {}, {}, {}
@@ -75,7 +78,7 @@ def fit(
             params = gpmm.Params(faces, at, face, motion, hold, known, gpmm.Prior(kind))
             models[kind].append((params, rows))
             total = total + _errors(params, train, rows)
-        errors |= dict(zip(_priors(kind), (total / FOLDS).tolist(), strict=True))
+        errors |= dict(zip(_priors(kind), (total / len(held)).tolist(), strict=True))
     prior = _best(errors)
     folded = tuple((params._replace(prior=prior), rows) for params, rows in models[prior.carried])
     known = gpmm.learn(learnt[prior.carried], carried=prior.carried, components=components)

@@ -23,7 +23,7 @@ BATCH = 16
 class Plan(NamedTuple):
     """How it is trained: L_pr alone (Otberdout et al. 2023, 4.2), otherwise as S2D-Dec."""
 
-    steps: int = 6_000
+    steps: int = 4_000
     batch: int = BATCH
     rate: float = 1e-3  # decays to zero along a cosine
     weight_decay: float = 5e-5

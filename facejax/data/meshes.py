@@ -66,15 +66,23 @@ class Meshes:
         """Whose meshes there are, in order."""
         return np.unique(self.owner)
 
-    def folds(self, count: int, *, by: str = "subjects") -> list[tuple[Meshes, Meshes]]:
-        """(fit, held out) for each of `count` groups of subjects, or of `by="labels"`, in sorted order."""
+    def groups(self, by: str) -> np.ndarray:
+        """What each mesh belongs to, (G,): its subject's number, or of `by="labels"` its label."""
         if by not in ("subjects", "labels"):
             raise ValueError(f"by: expected 'subjects' or 'labels', got {by!r}")
-        of = self.owner if by == "subjects" else self.labels
-        if not 2 <= count <= len(np.unique(of)):
-            raise ValueError(f"expected 2 to {len(np.unique(of))} folds of {len(np.unique(of))} {by}, got {count}")
-        groups = np.array_split(np.unique(of), count)
-        return [(self.where(~np.isin(of, g)), self.where(np.isin(of, g))) for g in groups]
+        return self.owner if by == "subjects" else self.labels
+
+    def folds(self, count: int, *, by: str = "subjects") -> list[tuple[Meshes, Meshes]]:
+        """(fit, held out) for each of `count` groups of subjects, or of labels, in sorted order.
+
+        Of fewer subjects (or labels) than `count`, one each. Raises `ValueError` where there is only one.
+        """
+        of = self.groups(by)
+        names = np.unique(of)
+        if count < 2 or len(names) < 2:
+            raise ValueError(f"expected 2 or more folds and {by}, got {count} and {len(names)}")
+        parts = np.array_split(names, min(count, len(names)))
+        return [(self.where(~np.isin(of, part)), self.where(np.isin(of, part))) for part in parts]
 
     def thin(self, step: int) -> Meshes:
         """Every `step`-th mesh."""
