@@ -1,4 +1,4 @@
-"""The command line: `facejax generate | animate | demo | labels | data | view`. A thin skin over the library.
+"""The command line: `facejax generate | animate | demo | labels | data | fit | view`. A thin skin over the library.
 
 Bad input ends with one line on standard error, exit code 2, and nothing written.
 """
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import Positional, UseAppendAction, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, subcommand
 
 Format = Literal["glb", "html", "webp", "gif", "mp4", "png", "npz", "ply", "obj"]
 
@@ -122,11 +122,9 @@ class Labels:
 
 
 @dataclasses.dataclass(frozen=True)
-class Data:
+class MakeHuman:
     """Prepare the free 4D dataset, or write neutral faces to try (`--sample`)."""
 
-    dataset: Positional[Literal["makehuman"]]
-    """Which dataset."""
     sample: Path | None = None
     """Write neutral faces into this folder, and prepare nothing."""
     count: int = 5
@@ -139,6 +137,48 @@ class Data:
     """Registration noise in mm, smooth over the surface; 0.1 to 0.5 is what scans have."""
     out: Path | None = None
     """Where the dataset goes; the user's cache by default."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepare:
+    """Read your own registered meshes into a dataset."""
+
+    source: Positional[Literal["folder"]]
+    """Where they come from: ROOT/SUBJECT/EXPRESSION/*.ply (.obj, .npy, .npz), or ROOT/SUBJECT/EXPRESSION.npz."""
+    root: Path
+    """The folder of the subjects' folders."""
+    landmarks: Path
+    """Landmarks of the first subject's neutral mesh: JSON of vertices or positions, MeshLab .pp, or plain text."""
+    out: Path
+    """Where the dataset goes: a folder that is not there yet."""
+    unit: Literal["mm", "cm", "m"] | None = None
+    """Of the meshes; recognised by the size of the face by default."""
+    fps: float = 30.0
+    """Frames per second of the recordings."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """Prepare a dataset: the free one, or your own meshes."""
+
+    what: OmitArgPrefixes[
+        Annotated[MakeHuman, subcommand("makehuman", prefix_name=False)]
+        | Annotated[Prepare, subcommand("prepare", prefix_name=False)]
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Train models on a prepared dataset, for `facejax generate --model`. Stopped, it goes on when called again."""
+
+    data: Path
+    """A prepared dataset, your own (`facejax data prepare folder`) or makehuman4d's folder."""
+    out: Path
+    """The models: a file that ends in .safetensors. Checkpoints lie in a folder beside it."""
+    seed: int = 0
+    """Of the initial weights and the order of the data."""
+    quick: bool = False
+    """A few steps only, to see that everything is in order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,6 +201,7 @@ Command = (
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Labels, subcommand("labels", prefix_name=False)]
     | Annotated[Data, subcommand("data", prefix_name=False)]
+    | Annotated[Fit, subcommand("fit", prefix_name=False)]
     | Annotated[View, subcommand("view", prefix_name=False)]
 )
 
@@ -273,11 +314,27 @@ def _data(command: Data) -> None:
     from facejax import produce
     from facejax.data import makehuman4d
 
-    if command.sample is not None:
+    command = command.what
+    if isinstance(command, Prepare):
+        _said(
+            produce.prepare_folder(
+                command.root, command.out, landmarks=command.landmarks, unit=command.unit, rate=command.fps
+            )
+        )
+    elif command.sample is not None:
         print("\n".join(str(path) for path in produce.sample_faces(command.sample, command.count)))
     else:
         spec = makehuman4d.Spec(level=command.level, head_motion=command.head_motion, noise=command.noise)
         print(produce.prepare(spec, folder=command.out))
+
+
+def _fit(command: Fit) -> None:
+    from facejax import produce
+
+    path, errors = produce.fit(command.data, command.out, quick=command.quick, seed=command.seed)
+    if errors:
+        print("people held out: {head:.3f} mm over the mesh, {face:.3f} mm over the face".format(**errors))
+    print(path)
 
 
 def _view(command: View) -> None:
@@ -289,7 +346,15 @@ def _view(command: View) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
-_COMMANDS = {Generate: _generate, Animate: _animate, Demo: _demo, Labels: _labels, Data: _data, View: _view}
+_COMMANDS = {
+    Generate: _generate,
+    Animate: _animate,
+    Demo: _demo,
+    Labels: _labels,
+    Data: _data,
+    Fit: _fit,
+    View: _view,
+}
 
 
 if __name__ == "__main__":

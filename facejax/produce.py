@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from facejax import animation, drive, files, io, pipeline, results
-from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait
+from facejax.data import assets, folder, livelink, makehuman, makehuman4d, noise, portrait
 from facejax.io import dress, faces
 
 
@@ -94,6 +94,40 @@ def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
         results.writable(folder)
     with results.progress(spec.name, spec.subjects) as advance:
         return makehuman4d.prepare(spec, folder=folder, progress=lambda done, total: advance(done)).path
+
+
+def fit(data: Path, out: Path, *, quick: bool = False, seed: int = 0) -> tuple[Path, dict[str, float]]:
+    """Train models on a store and write them; the file, and what is off on people held out (mm, by region).
+
+    Checkpoints lie beside it, in a folder of its name; called again, a stopped training goes on there. `quick`: a few
+    steps, to see that everything is in order.
+    """
+    from facejax import fit_models, fit_motion, fit_residual
+    from facejax.data import store
+
+    results.compile_cache()
+    found = store.open_store(data)
+    fit_models.check(found)
+    if out.suffix != ".safetensors":
+        raise ValueError(f"--out {out}: expected a file that ends in .safetensors")
+    results.writable(out.parent)
+    plans = fit_models.Plans()
+    if quick:
+        plans = fit_models.Plans(fit_motion.FlowPlan(steps=200), fit_residual.Plan(steps=50))
+    models = fit_models.fit(found, out.with_suffix(".training"), plans=plans, seed=seed)
+    errors = fit_models.judge(models, found)
+    pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))
+    return out, errors
+
+
+def prepare_folder(
+    root: Path, out: Path, *, landmarks: Path, unit: str | None = None, rate: float = 30.0
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Read a user's own meshes into a dataset; its folder, and what was assumed."""
+    results.check_rate(rate)
+    with results.progress(out.name, None) as advance:
+        made = folder.prepare(root, out, landmarks=landmarks, unit=unit, rate=rate, progress=advance)
+    return [made.path], tuple(made.index["notes"])
 
 
 def view(path: Path, out: Path | None = None, *, fps: float | None = None) -> Path:

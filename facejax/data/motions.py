@@ -55,7 +55,8 @@ def halves(
         rise = curve[sequence.onset : sequence.apex_start + 1]
         fall = curve[sequence.apex_end : sequence.offset + 1]
         for cut, start, end in ((rise, 0, label), (fall, label, 0)):
-            rows.append((_resample(cut, frames, by), start, end, sequence.subject, scale, _seconds(sequence, cut)))
+            if len(cut) > 1:  # what begins or ends at its apex has one half
+                rows.append((_resample(cut, frames, by), start, end, sequence.subject, scale, _seconds(sequence, cut)))
     return _stack(rows)
 
 

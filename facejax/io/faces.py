@@ -16,6 +16,7 @@ from facejax.io import meshes
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
 SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
+HEAD_RANGE = (150.0, 400.0)  # mm, the longest side of a head, or of a face alone
 
 
 class Topology(NamedTuple):
@@ -74,6 +75,17 @@ def unit_of(size: float, name: str) -> tuple[float, str]:
             return millimetres, unit
     raise meshes.MeshError(
         f"{name}: the face is {size:.3g} times as large as a head in millimetres; expected one in {', '.join(UNITS)}"
+    )
+
+
+def unit_of_head(size: float, name: str) -> tuple[float, str]:
+    """The same for a whole mesh, by the longest side of the box around it, where no landmarks are comparable."""
+    for unit, millimetres in UNITS.items():
+        if HEAD_RANGE[0] <= size * millimetres <= HEAD_RANGE[1]:
+            return millimetres, unit
+    low, high = HEAD_RANGE
+    raise meshes.MeshError(
+        f"{name}: {size:.3g} in size; expected a head of {low:g} to {high:g} mm, given in {', '.join(UNITS)}"
     )
 
 

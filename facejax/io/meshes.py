@@ -83,8 +83,10 @@ def read(path: str | os.PathLike) -> Mesh:
     return _checked(path, vertices, faces)
 
 
-def read_animation(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dict]:
+def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.ndarray, np.ndarray | None, dict]:
     """Reads an NPZ of `vertices` (T, N, 3) or (N, 3) and `faces`; and what else it holds of `landmarks` and `fps`.
+
+    `bare`: it may lack faces, which are None then. Frames after the first are not looked at.
 
     Raises:
       MeshError: as `read`.
@@ -97,15 +99,15 @@ def read_animation(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray, dic
     except (OSError, *_DAMAGE) as error:
         raise MeshError(f"{path}: {error}") from error
     vertices, faces = arrays.pop("vertices"), arrays.pop("faces", None)
-    if faces is None:
+    if faces is None and not bare:
         raise MeshError(f"{path}: has no triangles, nothing to show")
     if vertices.ndim not in (2, 3) or 0 in vertices.shape:
         raise MeshError(f"{path}: vertices must be (T, N, 3) or (N, 3), got {vertices.shape}")
-    _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
+    first = _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
     extra = {"landmarks": arrays["landmarks"]} if "landmarks" in arrays else {}
     if "fps" in arrays:
         extra["fps"] = float(arrays["fps"].ravel()[0])
-    return vertices, faces.astype(np.int32), extra
+    return vertices, first.faces if bare else faces.astype(np.int32), extra
 
 
 def write(path: str | os.PathLike, vertices, faces=None) -> None:

@@ -43,6 +43,18 @@ def test_npy_holds_vertices(tmp_path):
     np.testing.assert_array_equal(meshes.read(tmp_path / "frame.npy").vertices, vertices)
 
 
+def test_an_animation_may_be_asked_for_without_faces(tmp_path):
+    vertices, faces = _tetrahedron()
+    np.savez(tmp_path / "bare.npz", vertices=np.stack([vertices] * 3))
+    with pytest.raises(meshes.MeshError, match="has no triangles"):
+        meshes.read_animation(tmp_path / "bare.npz")
+    moved, none, extra = meshes.read_animation(tmp_path / "bare.npz", bare=True)
+    assert moved.shape == (3, 4, 3) and none is None and extra == {}
+    np.savez(tmp_path / "whole.npz", vertices=moved, faces=faces, fps=25)
+    _, there, extra = meshes.read_animation(tmp_path / "whole.npz", bare=True)
+    assert there.dtype == np.int32 and there.tolist() == faces.tolist() and extra == {"fps": 25}
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
 def test_reads_what_trimesh_writes(tmp_path, encoding):
     mesh = trimesh.creation.icosphere(subdivisions=2)
