@@ -1,7 +1,7 @@
-"""What the experiments on landmarks -> mesh share: who is trained on and judged, and results that are kept.
+"""What the experiments on landmarks -> mesh share: methods fitted to cases, and results that are kept.
 
-A *case* is one fold of one protocol. A method's distances on a case are kept in its folder, so that a comparison that
-was stopped goes on, and one method can be added later.
+A *case* is one fold of one protocol (`experiments._cases`). A method's distances on a case are kept in its folder, so
+that a comparison that was stopped goes on, and one method can be added later.
 """
 
 from __future__ import annotations
@@ -11,21 +11,15 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments._cases import Case, Mode
 from facejax import evaluation, files, fit_decoder, fit_neural3dmm, fit_residual, journal, methods
-from facejax.data import cache, makehuman, makehuman4d, performance, store
-from facejax.data.meshes import Meshes, of_split
-from facejax.mesh import graph, topology
+from facejax.mesh import topology
 
-MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
-FACE_REACH = 25.0  # mm along the surface
-FOLDS = 4
-QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
 QUICK_STEPS, QUICK_COMPONENTS = 100, 60
-Mode = Literal["quick", "default", "paper"]
 NAMES = {
     "s2d": "S2D-Dec",
     "s2d_residual": "residual decoder",
@@ -41,131 +35,12 @@ NAMES = {
 }
 
 
-class Case(NamedTuple):
-    """One fold: what to fit to, what to judge on, and what is new in it."""
-
-    split: str
-    fold: int
-    train: Meshes
-    test: Meshes
-    by: str  # "subjects" or "labels"
-
-    @property
-    def name(self) -> str:
-        """The folder's name."""
-        return f"{self.split}-{self.fold}"
-
-
 class Result(NamedTuple):
     """A method on a case."""
 
     distances: evaluation.Distances
     seconds: float  # of fitting, however often it was stopped
     about: dict[str, Any]  # what was chosen
-
-
-def data_of(path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED):
-    """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
-    if path is not None:
-        return store.open_store(path)
-    size = QUICK if mode == "quick" else {}
-    return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
-
-
-def is_makehuman(data: store.Store) -> bool:
-    """Whether the store holds the embedded dataset."""
-    return data.index.get("name") == "makehuman4d"
-
-
-def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
-    """The folds of each protocol.
-
-    `identity`: four folds over the sorted training and validation subjects. `expression`: four over the sorted names of
-    CoMA's expressions, of the same people; other data: over all names. `test`: fitted to all those people, judged on
-    the test subjects. Datasets of OT23 4.1 that have splits of their own get them (D3DFACS, Florence 4D, BU-3DFE).
-    """
-    known = [split for split in ("train", "validation") if len(data.subjects(split))]
-    people = at_most(of_split(data, *known))
-    found = []
-    for split in splits:
-        if split == "test":
-            found.append(Case("test", 0, people, at_most(of_split(data, "test")), "subjects"))
-        elif split in ("identity", "expression"):
-            found += _PUBLISHED.get(data.index.get("name"), _four_folds)(people, split)
-        else:
-            raise ValueError(f"unknown split {split!r}, expected identity, expression or test")
-    return found
-
-
-def _four_folds(people: Meshes, split: str) -> list[Case]:
-    by = "subjects" if split == "identity" else "labels"
-    if by == "labels" and is_makehuman(people.data):
-        people = people.of_labels(performance.COMA)
-    return [Case(split, i, fit, held, by) for i, (fit, held) in enumerate(people.folds(FOLDS, by=by))]
-
-
-def _one_fold(people: Meshes, split: str, held: np.ndarray) -> list[Case]:
-    return [Case(split, 0, people.where(~held), people.where(held), "subjects" if split == "identity" else "labels")]
-
-
-def _d3dfacs(people: Meshes, split: str) -> list[Case]:
-    """The last seven subjects train; the first eleven expressions of each are left out."""
-    if split == "identity":
-        return _one_fold(people, split, ~np.isin(people.owner, people.subjects[-7:]))
-    return _one_fold(people, split, _first_of_each(people, 11))
-
-
-def _florence(people: Meshes, split: str) -> list[Case]:
-    """The last 30 women and 10 men, or the first two expressions of each, are left out."""
-    if split == "expression":
-        return _one_fold(people, split, _first_of_each(people, 2))
-    sex = np.array([people.data.index["subjects"][i].get("sex", "") for i in people.subjects])
-    held = np.concatenate([people.subjects[sex == "female"][-30:], people.subjects[sex == "male"][-10:]])
-    return _one_fold(people, split, np.isin(people.owner, held))
-
-
-def _bu3dfe(people: Meshes, split: str) -> list[Case]:
-    """The first ten subjects, or anger and disgust, are left out."""
-    if split == "identity":
-        return _one_fold(people, split, np.isin(people.owner, people.subjects[:10]))
-    return _one_fold(people, split, np.isin(people.labels, ["angry", "anger", "disgust"]))
-
-
-def _first_of_each(people: Meshes, count: int) -> np.ndarray:
-    held = np.zeros(people.count, bool)
-    for subject in people.subjects:
-        mine = people.owner == subject
-        held |= mine & np.isin(people.labels, np.unique(people.labels[mine])[:count])
-    return held
-
-
-_PUBLISHED = {"d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
-
-
-def at_most(meshes: Meshes) -> Meshes:
-    """The meshes, or a fixed draw of 20,000 of them."""
-    if meshes.count <= MOST:
-        return meshes
-    keep = np.sort(np.random.default_rng(0).permutation(meshes.count)[:MOST])
-    return meshes.where(np.isin(np.arange(meshes.count), keep))
-
-
-def regions_of(data: store.Store) -> dict[str, np.ndarray]:
-    """The whole head, and the face: 25 mm along the surface about a landmark."""
-    if is_makehuman(data):
-        mask = makehuman.template().face_mask
-    else:
-        mean = np.asarray(data.neutral, np.float64).mean(axis=0)
-        mask = graph.geodesic(mean, np.asarray(data.faces), np.asarray(data.landmark_index)) <= FACE_REACH
-    return {"head": np.ones_like(mask), "face": mask}
-
-
-def hierarchy_of(data: store.Store) -> topology.Hierarchy:
-    """The levels that spiral networks climb."""
-    template = (
-        makehuman.template().vertices if is_makehuman(data) else np.asarray(data.neutral, np.float64).mean(axis=0)
-    )
-    return topology.build(template, np.asarray(data.faces), cache=cache.folder())
 
 
 def options_of(case: Case, mode: Mode, seed: int, hierarchy: topology.Hierarchy, **plans) -> methods.Options:
@@ -298,6 +173,17 @@ def pooled(results: Sequence[Result]) -> evaluation.Distances:
     for result in results[1:]:
         total = total.add(result.distances)
     return total
+
+
+def drawn(figure: Any, path: Path) -> Path:
+    """Write a matplotlib figure and let go of it."""
+    from matplotlib import pyplot
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
+    pyplot.close(figure)
+    return path
 
 
 def mode_of(config: Any) -> Mode:

@@ -15,7 +15,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 from facejax import evaluation
 
 matplotlib.use("Agg")
@@ -53,8 +53,8 @@ def run(config: Config) -> dict[str, Any]:
     """The share of vertices below each distance, per split, region and method."""
     mode = _dense.mode_of(config)
     _dense.check_methods(config.methods)
-    data = _dense.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
+    data = _cases.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
     curves, seconds = [], 0.0
     for split in config.splits:
         for name in config.methods:
@@ -62,7 +62,7 @@ def run(config: Config) -> dict[str, Any]:
                 _dense.judge(name, case, config.runs, _dense.options_of(case, mode, config.seed, hierarchy), regions)[
                     0.0
                 ]
-                for case in _dense.cases(data, [split])
+                for case in _cases.cases(data, [split])
             ]
             seconds += sum(part.seconds for part in parts)
             shares = _dense.pooled(parts).cumulative()
@@ -112,10 +112,7 @@ def _plot(path: Path, curves, regions: list[str], config: Config) -> Path:
             axis.grid(alpha=0.3)
         line[0].set_ylabel("share of vertices nearer than")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 from facejax import files, methods
 from facejax.io import render
 
@@ -54,9 +54,9 @@ def run(config: Config) -> dict[str, Any]:
     """A sheet: one row per face, the truth and then each method; and each one's mean error."""
     mode, begun = _dense.mode_of(config), time.perf_counter()
     _dense.check_methods(config.methods)
-    data = _dense.data_of(config.data, mode, level=config.level)
-    case = _dense.cases(data, ["identity"])[0]
-    options = _dense.options_of(case, mode, config.seed, _dense.hierarchy_of(data))
+    data = _cases.data_of(config.data, mode, level=config.level)
+    case = _cases.cases(data, ["identity"])[0]
+    options = _dense.options_of(case, mode, config.seed, _cases.hierarchy_of(data))
     chosen = _strongest(case.test)
     true = [_true(case.test, row) for row in chosen]
     columns = [[_face(data, vertices) for vertices in true]]

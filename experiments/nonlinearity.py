@@ -22,7 +22,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 from facejax import evaluation, fit_decoder, floor, methods
 from facejax.data import rig
 from facejax.models import gpmm, linear
@@ -67,10 +67,10 @@ def run(config: Config) -> dict[str, Any]:
     rows, floors, seconds = [], [], 0.0
     for noise in config.noises:
         for level in config.levels:
-            data = _dense.data_of(None, mode, level=level, noise=noise)
-            regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
+            data = _cases.data_of(None, mode, level=level, noise=noise)
+            regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
             for split in config.splits:
-                case = _dense.cases(data, [split])[0]
+                case = _cases.cases(data, [split])[0]
                 where = {"level": level, "noise_mm": noise, "split": split}
                 plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
                 options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
@@ -194,10 +194,7 @@ def _plot(path: Path, rows, floors, config: Config) -> Path:
                 axis.title.set_fontsize(9)
         line[0].set_ylabel("mean vertex error of the face, mm")
     axes[0, 0].legend(frameon=False, fontsize=7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -68,10 +68,10 @@ def run(config: Config) -> dict[str, Any]:
     """One row per method, split and region."""
     mode = _dense.mode_of(config)
     _dense.check_methods(config.methods)
-    data = _dense.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
+    data = _cases.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
     results: dict[tuple[str, str], list] = {}
-    found = _dense.cases(data, config.splits)
+    found = _cases.cases(data, config.splits)
     for case in found:
         for name in config.methods:
             begun = time.perf_counter()
@@ -141,10 +141,7 @@ def _plot(path: Path, rows, config: Config) -> Path:
         axis.margins(x=0.18)
         axis.set(title=f"{split} split", xlabel="mean vertex error, mm")
     axes[0, 0].legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run, _transferred
+from experiments import _cases, _dense, _run, _transferred
 from facejax import drive, methods
 from facejax.data import livelink, makehuman, makehuman4d, performance
 from facejax.data.meshes import of_split
@@ -63,12 +63,16 @@ def run(config: Config) -> dict[str, Any]:
     """One row per method and region."""
     mode = _dense.mode_of(config)
     _dense.check_methods(config.methods)
-    data = _dense.data_of(None, mode)
-    regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
-    train = _dense.at_most(of_split(data, "train", "validation").of_labels(performance.COMA))
-    case = _dense.Case("speech", 0, train, train, "labels")
+    data = _cases.data_of(None, mode)
+    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+    train = _cases.at_most(of_split(data, "train", "validation").of_labels(performance.COMA))
+    case = _cases.Case("speech", 0, train, train, "labels")
     options = _dense.options_of(case, mode, config.seed, hierarchy)
     source, *others = data.subjects("test")[: config.people + 1]
+    if not 1 <= config.people <= len(data.subjects("test")) - 1:
+        raise ValueError(
+            f"--people: expected 1 to {len(data.subjects('test')) - 1} besides the source, got {config.people}"
+        )
     takes = _passages(config)
     faces = {index: makehuman.subject(int(index), seed=makehuman4d.SEED) for index in (source, *others)}
     moved = {index: [_skin(take, faces[index]) for take in takes] for index in faces}
@@ -143,10 +147,7 @@ def _plot(path: Path, rows, methods_) -> Path:
     axis.set_xticks(range(len(methods_)), [_dense.NAMES[name] for name in methods_], rotation=20, ha="right")
     axis.set_ylabel("mean vertex error of the face, mm")
     axis.legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 from facejax.data import store
 from facejax.data.meshes import Meshes, of_split
 
@@ -63,19 +63,19 @@ def run(config: Config) -> dict[str, Any]:
     """One row per direction, method and region."""
     mode = _dense.mode_of(config)
     _dense.check_methods(config.methods)
-    a = _dense.data_of(config.first, mode, seed=SEEDS[0])
-    b = _dense.data_of(config.second, mode, seed=SEEDS[1], noise=NOISE)
+    a = _cases.data_of(config.first, mode, seed=SEEDS[0])
+    b = _cases.data_of(config.second, mode, seed=SEEDS[1], noise=NOISE)
     if not np.array_equal(a.faces, b.faces):
         raise ValueError(f"{a.path} and {b.path} have other triangles: both have to be in one topology")
-    regions, hierarchy = _dense.regions_of(a), _dense.hierarchy_of(a)
+    regions, hierarchy = _cases.regions_of(a), _cases.hierarchy_of(a)
     directions = [("A to B", a, _everybody(b)), ("B to A", b, of_split(a, "test"))]
     if config.second is None:
-        clean = _dense.data_of(None, mode, seed=SEEDS[1])
+        clean = _cases.data_of(None, mode, seed=SEEDS[1])
         directions.insert(1, ("A to B, clean", a, _everybody(clean)))
     rows, seconds = [], 0.0
     for title, source, test in directions:
-        case = _dense.Case(
-            title.replace(" ", "_").replace(",", ""), 0, _training(source), _dense.at_most(test), "subjects"
+        case = _cases.Case(
+            title.replace(" ", "_").replace(",", ""), 0, _training(source), _cases.at_most(test), "subjects"
         )
         options = _dense.options_of(case, mode, config.seed, hierarchy)
         for name in config.methods:
@@ -102,7 +102,7 @@ def _everybody(data: store.Store) -> Meshes:
 
 def _training(data: store.Store) -> Meshes:
     known = [split for split in ("train", "validation") if len(data.subjects(split))]
-    return _dense.at_most(of_split(data, *known))
+    return _cases.at_most(of_split(data, *known))
 
 
 def _value(rows, direction: str, method: str, region: str, what: str = "mean_mm") -> float:
@@ -137,10 +137,7 @@ def _plot(path: Path, rows, titles, methods) -> Path:
     axis.set_xticks(range(len(titles)), titles)
     axis.set_ylabel("mean vertex error of the face, mm")
     axis.legend(frameon=False, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

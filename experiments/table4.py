@@ -22,7 +22,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _dense, _run
+from experiments import _cases, _dense, _run
 from facejax import fit_decoder
 
 matplotlib.use("Agg")
@@ -64,9 +64,9 @@ class Config:
 def run(config: Config) -> dict[str, Any]:
     """One row per variant and region."""
     mode = _dense.mode_of(config)
-    data = _dense.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _dense.regions_of(data), _dense.hierarchy_of(data)
-    case = _dense.cases(data, ["identity"])[0]
+    data = _cases.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+    case = _cases.cases(data, ["identity"])[0]
     rows, seconds = [], 0.0
     for name, changes in VARIANTS.items():
         begun = time.perf_counter()
@@ -110,10 +110,7 @@ def _plot(path: Path, rows) -> Path:
     axis.invert_yaxis()
     axis.set_xlabel("mean vertex error, mm")
     axis.legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _dense.drawn(figure, path)
 
 
 if __name__ == "__main__":

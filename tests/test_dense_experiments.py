@@ -1,0 +1,200 @@
+"""The experiments on landmarks -> mesh, on tiny datasets and for a step or two: they run, keep results, go on."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments import _cases, _dense, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
+from facejax import evaluation, fit_gpmm, methods
+from facejax.data import store
+from facejax.data.meshes import of_split
+from tests.test_cli import recorded
+from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
+
+
+@pytest.fixture
+def tiny(own_cache, monkeypatch):  # noqa: F811
+    """Six people, two steps, few candidates."""
+    monkeypatch.setattr(_cases, "QUICK", {"subjects": 6, "meshes": 260})
+    monkeypatch.setattr(_dense, "QUICK_STEPS", 2)
+    monkeypatch.setattr(_dense, "QUICK_COMPONENTS", 8)
+    monkeypatch.setattr(_cases, "FOLDS", 2)
+    monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
+    monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.0, 0.03))
+    monkeypatch.setattr(fit_gpmm, "NOISE", (1e-4,))
+    monkeypatch.setattr(fit_gpmm, "JUDGED", 1)
+
+
+def test_table1_has_a_row_for_each_and_goes_on(tiny, tmp_path, monkeypatch):
+    table1.run(table1.Config(out=tmp_path / "o", quick=True, methods=("s2d",), splits=("test",)))
+    rows = check(tmp_path / "o", "rows")["rows"]
+    assert [r["region"] for r in rows] == ["head", "face"] and rows[0]["chosen"] == [{"steps": 2}]
+    config = table1.Config(out=tmp_path / "o", quick=True, methods=("ridge", "rbf"), splits=("identity", "test"))
+    table1.run(config)
+    metrics = check(tmp_path / "o", "rows", "mode", "paper_mm")
+    rows = metrics["rows"]
+    assert metrics["mode"] == "quick" and len(rows) == 2 * 2 * 2
+    assert {(r["method"], r["split"], r["region"]) for r in rows} == {
+        (m, s, r) for m in config.methods for s in config.splits for r in ("head", "face")
+    }
+    assert all(r["mean_mm"] > 0 and r["std_mm"] > 0 for r in rows)
+    assert all(len(r["folds_mm"]) == (2 if r["split"] == "identity" else 1) for r in rows)
+    # Known results are read, not made again.
+    monkeypatch.setattr(methods, "METHODS", dict.fromkeys(methods.METHODS))
+    table1.run(config)
+    assert json.loads((tmp_path / "o" / "metrics.json").read_text())["rows"] == rows
+    # The curves are of the same results.
+    curves = figure5.run(
+        figure5.Config(
+            out=tmp_path / "f", runs=tmp_path / "o", quick=True, methods=config.methods, splits=("identity",)
+        )
+    )["curves"]
+    check(tmp_path / "f", "edges_mm", "curves")
+    assert len(curves) == 4 and all(np.all(np.diff(c["share"]) >= 0) and c["share"][-1] > 0.99 for c in curves)
+
+
+def test_table1_on_a_store_of_ones_own(tiny, tiny_store, tmp_path):
+    found = table1.run(
+        table1.Config(out=tmp_path / "o", quick=True, data=tiny_store.path, methods=("still",), splits=("expression",))
+    )
+    assert found["data"] == "makehuman4d" and found["rows"][0]["mean_mm"] > 0.1
+
+
+def test_a_result_is_made_anew_when_what_it_depends_on_changes(tiny, tiny_store, tmp_path, monkeypatch):
+    case = _cases.cases(tiny_store, ["identity"])[0]
+    regions, options = _cases.regions_of(tiny_store), methods.Options()
+    first = _dense.judge("still", case, tmp_path, options, regions)[0.0]
+    again = _dense.judge("still", case, tmp_path, options, regions)[0.0]
+    np.testing.assert_array_equal(first.distances.total, again.distances.total)
+    fewer = case._replace(test=case.test.thin(2))
+    assert _dense.judge("still", fewer, tmp_path, options, regions)[0.0].distances.count < first.distances.count
+
+
+def test_cases_share_nobody_or_no_expression(tiny_store):
+    people = set(tiny_store.subjects("train")) | set(tiny_store.subjects("validation"))
+    identity = _cases.cases(tiny_store, ["identity"])
+    assert len(identity) == 4 and {i for c in identity for i in c.test.subjects} == people
+    assert all(not set(c.train.subjects) & set(c.test.subjects) and c.by == "subjects" for c in identity)
+    expression = _cases.cases(tiny_store, ["expression"])
+    held = [set(c.test.labels) for c in expression]
+    assert all(not set(c.train.labels) & h and c.by == "labels" for c, h in zip(expression, held, strict=True))
+    assert "anger" not in set.union(*held)
+    (test,) = _cases.cases(tiny_store, ["test"])
+    assert set(test.test.subjects) == set(tiny_store.subjects("test")) and set(test.train.subjects) == people
+    with pytest.raises(ValueError, match="unknown split 'age'"):
+        _cases.cases(tiny_store, ["age"])
+
+
+@pytest.mark.parametrize(
+    ("name", "identity", "expression"),
+    [
+        ("d3dfacs", 3, {f"e{i:02}" for i in range(11)}),
+        ("bu3dfe", 10, {"angry", "disgust"}),
+        ("florence4d", 40, {"e00", "e01"}),
+    ],
+)
+def test_published_splits(tiny_store, name, identity, expression):
+    """Of OT23 4.1, on an index that stands for the dataset: one mesh of each person and expression."""
+    labels = (
+        [f"e{i:02}" for i in range(14)] + ["angry", "disgust"] if name == "bu3dfe" else [f"e{i:02}" for i in range(14)]
+    )
+    count = {"d3dfacs": 10, "bu3dfe": 20, "florence4d": 60}[name]
+    recordings = [store.Sequence(p, label, 0, 1, 0, 0, 0, 0, 0.1) for p in range(count) for label in labels]
+    people = [{"name": f"p{i}", "split": "train", "sex": "female" if i < 45 else "male"} for i in range(count)]
+    data = tiny_store._replace(
+        index=tiny_store.index | {"name": name, "subjects": people},
+        sequences=tuple(recordings),
+        drawn=np.arange(len(recordings)),
+        vertices=np.broadcast_to(tiny_store.vertices[:1], (len(recordings), *tiny_store.vertices.shape[1:])),
+    )
+    (by_person,) = _cases.cases(data, ["identity"])
+    assert len(by_person.test.subjects) == identity
+    (by_label,) = _cases.cases(data, ["expression"])
+    assert set(by_label.test.labels) == expression and by_label.test.count + by_label.train.count == len(recordings)
+    held = by_person.test.subjects
+    if name == "florence4d":
+        assert set(held) == {*range(15, 45), *range(50, 60)}
+    else:
+        assert set(held) == set(range(identity))
+
+
+def test_table3_in_both_directions(tiny, tmp_path):
+    found = table3.run(table3.Config(out=tmp_path / "o", quick=True, methods=("ridge",)))
+    check(tmp_path / "o", "rows", "paper_mm")
+    errors = {r["direction"]: r["mean_mm"] for r in found["rows"] if r["region"] == "head"}
+    assert set(errors) == {"A to B", "A to B, clean", "B to A"}
+    assert errors["A to B"] > errors["A to B, clean"] > 0
+
+
+def test_table4_trains_each_variant(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(table4, "VARIANTS", {name: table4.VARIANTS[name] for name in ("S1", "S3, inverse, reference")})
+    found = table4.run(table4.Config(out=tmp_path / "o", quick=True))
+    check(tmp_path / "o", "rows", "paper_mm")
+    assert len({r["mean_mm"] for r in found["rows"]}) == 4
+
+
+def test_nonlinearity_with_noise_and_floor(tiny, tmp_path):
+    config = nonlinearity.Config(
+        out=tmp_path / "o", quick=True, levels=(0,), noises=(0.0,), methods=("ridge",), splits=("test",)
+    )
+    found = nonlinearity.run(config)
+    check(tmp_path / "o", "rows", "floor")
+    head = {(r["method"], r["landmark_noise_mm"]): r["mean_mm"] for r in found["rows"] if r["region"] == "head"}
+    assert set(head) == {(m, n) for m in ("ridge", "told") for n in (0.0, 0.5, 1.0)}
+    assert head["ridge", 0.0] < 0.1 * head["ridge", 1.0] and head["told", 1.0] < head["ridge", 1.0]
+
+
+def test_table2_carries_a_recording_to_others(tiny, tmp_path, monkeypatch):
+    take = recorded(tmp_path / "take.csv")
+    config = table2.Config(
+        recording=take, out=tmp_path / "o", quick=True, people=1, passages=2, seconds=0.5, methods=("still", "rbf")
+    )
+    with pytest.raises(ValueError, match="--people: expected 1 to 0"):
+        table2.run(config)
+    monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
+    rows = {(r["method"], r["region"]): r for r in table2.run(config)["rows"]}
+    check(tmp_path / "o", "rows", "window")
+    assert rows["rbf", "face"]["own_mm"] < rows["still", "face"]["own_mm"]
+    for row in rows.values():
+        assert row["transferred_window_mm"] <= row["transferred_mm"]
+        assert row["own_window_mm"] <= row["own_mm"]
+
+
+def test_figures_of_faces(tiny, tmp_path):
+    found = figure6.run(figure6.Config(out=tmp_path / "a", runs=tmp_path / "r", quick=True, methods=("still", "rbf")))
+    check(tmp_path / "a", "rows", "red_mm")
+    errors = {m: np.mean([r["mean_mm"] for r in found["rows"] if r["method"] == m]) for m in ("still", "rbf")}
+    assert errors["rbf"] < errors["still"] and (tmp_path / "a" / "figure6.png").exists()
+    found = figure9.run(figure9.Config(out=tmp_path / "b"))
+    check(tmp_path / "b", "transfer", "chains")
+    assert all(row["mean_mm"] < 0.8 * row["still_mm"] for row in found["transfer"])
+    assert {p.name for p in (tmp_path / "b").glob("*.glb")} == {
+        "chain1.glb", "chain2.glb", "source.glb", "transfer1.glb", "transfer2.glb",
+    }  # fmt: skip
+
+
+def test_modes_exclude_each_other():
+    with pytest.raises(ValueError, match="--quick and --paper"):
+        table1.run(table1.Config(quick=True, paper=True))
+    with pytest.raises(ValueError, match="unknown method 'magic'"):
+        table1.run(table1.Config(quick=True, methods=("magic",)))
+
+
+def test_distances_add_up(tiny_store):
+    meshes = of_split(tiny_store, "train")
+    parts = [evaluation.distances(_still, meshes.where(meshes.owner == s), _all(meshes)) for s in meshes.subjects]
+    whole = evaluation.distances(_still, meshes, _all(meshes))
+    total = parts[0]
+    for part in parts[1:]:
+        total = total.add(part)
+    np.testing.assert_allclose(total.total, whole.total)
+    assert total.count == whole.count and (total.histogram == whole.histogram).all()
+
+
+def _still(marks, rest):
+    return np.broadcast_to(rest, (len(marks), *rest.shape))
+
+
+def _all(meshes):
+    return {"head": np.ones(meshes.data.neutral.shape[1], bool)}

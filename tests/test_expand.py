@@ -1,0 +1,96 @@
+"""From a face's landmarks to its mesh, on tiny balls: what is remembered, cut in pieces, and written to files."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from facejax import expand, fit_gpmm
+from facejax.data.meshes import of_split
+from facejax.mesh import strain, topology
+from facejax.models import gpmm, linear, residual
+
+
+def built(store, *, carried, gate):
+    """Parameters whose network says something, though it was never trained."""
+    train = of_split(store, "train")
+    base = fit_gpmm.fit(train, components=20, carried=(carried,)).params
+    hierarchy = topology.build(base.face, store.faces, factors=(2, 2, 2, 2), lengths=3)
+    ones = jnp.ones(())
+    scale = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((5, 3)), ones, 0.2 * ones)
+    network = residual.init(jax.random.key(0), hierarchy, scale)
+    spoken = network.weights | {"shared": 0.1 * jax.random.normal(jax.random.key(1), network.weights["shared"].shape)}
+    tables = strain.around(store.faces, len(base.face))
+    return expand.Params(base, network._replace(weights=spoken, gate=jnp.float32(gate)), hierarchy, tables)
+
+
+@pytest.fixture(scope="module")
+def params(ball_store):
+    return built(ball_store, carried=True, gate=0.5)
+
+
+@pytest.fixture(scope="module")
+def person(ball_store):
+    return of_split(ball_store, "test").person(1)
+
+
+def test_it_is_the_linear_answer_and_the_networks_share(params, person):
+    neutral, marks, _ = person
+    base = np.asarray(linear.apply(gpmm.on_face(params.base, neutral), marks))
+    rest = np.broadcast_to(neutral, base.shape)
+    whole = residual.apply(params.network, params.hierarchy, params.tables, marks, base, rest)
+    found = np.asarray(expand.apply(params, marks, neutral))
+    np.testing.assert_allclose(found, whole, atol=2e-5)
+    assert np.abs(found - base).max() > 1e-3
+    closed = params._replace(network=params.network._replace(gate=jnp.zeros(())))
+    np.testing.assert_array_equal(expand.apply(closed, marks, neutral), base)
+
+
+@pytest.mark.parametrize("lead", [(), (1,), (3, 2), (37,)], ids=str)
+def test_leading_axes_are_free_and_pieces_do_not_show(params, person, lead):
+    neutral, marks, _ = person
+    rng = np.random.default_rng(0)
+    many = marks[rng.integers(len(marks), size=lead)]
+    found = np.asarray(expand.apply(params, many, neutral))
+    assert found.shape == (*lead, *neutral.shape)
+    one_by_one = [expand.apply(params, row[None], neutral)[0] for row in many.reshape(-1, *marks.shape[1:])]
+    np.testing.assert_allclose(found.reshape(-1, *neutral.shape), np.asarray(one_by_one), atol=2e-5)
+
+
+def test_a_face_is_worked_out_once_and_the_last_few_are_remembered(params, person, monkeypatch):
+    neutral, marks, _ = person
+    asked = []
+    true = gpmm.on_face
+    monkeypatch.setattr(expand, "FACES", 2)
+    monkeypatch.setattr(gpmm, "on_face", lambda base, face: asked.append(1) or true(base, face))
+    faces = [neutral + shift for shift in (1.0, 2.0, 3.0)]
+    first = [np.asarray(expand.apply(params, marks, face)) for face in faces]
+    assert len(asked) == 3
+    np.testing.assert_array_equal(expand.apply(params, marks, faces[2]), first[2])
+    assert len(asked) == 3
+    np.testing.assert_array_equal(expand.apply(params, marks, faces[0]), first[0])
+    assert len(asked) == 4
+
+
+def test_a_traced_face_is_refused(params, person):
+    neutral, marks, _ = person
+    with pytest.raises(ValueError, match="every face is prepared on the host"):
+        jax.jit(lambda face: expand.apply(params, marks, face))(neutral)
+
+
+@pytest.mark.parametrize("carried", [True, False])
+def test_a_file_holds_all_to_half_precision(ball_store, person, carried):
+    params = built(ball_store, carried=carried, gate=0.25)
+    tree = jax.tree.map(np.asarray, expand.pack(params))
+    again = expand.unpack(tree, params.hierarchy, ball_store.faces)
+    assert again.base.prior == params.base.prior and float(again.network.gate) == 0.25
+    neutral, marks, _ = person
+    found, expected = (np.asarray(expand.apply(p, marks, neutral)) for p in (again, params))
+    assert np.abs(found - expected).max() < 5e-3 * np.abs(expected).max()
+
+
+def test_fewer_components_weigh_less(params):
+    tree = expand.pack(params, components=3)
+    assert tree["base"]["components"].shape[0] == 3 and tree["base"]["variance"].shape == (3,)
+    with pytest.raises(KeyError):
+        expand.unpack({"base": {}, "network": {}}, params.hierarchy, params.base.faces)

@@ -1,0 +1,90 @@
+"""Models of one's own, from a store to an animation; and datasets that nothing can be learnt from."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from facejax import cli, fit_gpmm, fit_models, fit_motion, fit_residual, pipeline
+from facejax.data import makehuman4d
+
+PLANS = fit_models.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Plan(steps=2, batch=4))
+
+
+@pytest.fixture(scope="module")
+def few():
+    """Few candidates for the prior."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_gpmm, "FOLDS", 2)
+        patch.setattr(fit_gpmm, "SMOOTH", (0.003,))
+        patch.setattr(fit_gpmm, "NOISE", (1e-4,))
+        patch.setattr(fit_gpmm, "JUDGED", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def models(few, tiny_store, tmp_path_factory):
+    return fit_models.fit(tiny_store, tmp_path_factory.mktemp("fit"), plans=PLANS)
+
+
+def test_models_of_ones_own_generate_from_a_file(models, tiny_store, tmp_path):
+    errors = fit_models.judge(models, tiny_store)
+    assert 0 < errors["head"] < errors["face"] < 0.3
+    path = tmp_path / "own.safetensors"
+    pipeline.save(path, models._replace(about=models.about | {"error_mm": errors}))
+    read = pipeline.load(path)
+    assert read.labels == tiny_store.labels and read.about["error_mm"] == errors
+    neutral = np.asarray(tiny_store.neutral[5])
+    for found in (read, models):
+        marks = pipeline.landmarks(found, jax.random.key(0), ["neutral", "anger", "neutral"], neutral, frames=5)
+        vertices = np.asarray(pipeline.meshes(found, marks, neutral))
+        assert vertices.shape == (9, 3260, 3)
+        np.testing.assert_allclose(vertices[-1], neutral, atol=0.2)
+        # The mesh goes where the person's landmarks go.
+        take = next(s for s in tiny_store.sequences if s.subject == 5 and s.label == "high_smile")
+        marks = tiny_store.landmarks[take.start : take.start + take.frames]
+        carried = np.asarray(pipeline.meshes(found, marks, neutral))[:, tiny_store.landmark_index]
+        moved = np.linalg.norm(marks - neutral[tiny_store.landmark_index], axis=-1).mean()
+        assert np.linalg.norm(carried - marks, axis=-1).mean() < 0.2 * moved
+    assert path.stat().st_size < 25e6
+
+
+def test_what_cannot_be_learnt_from_is_named(tiny_store):
+    people = [person | {"split": "test" if i else "train"} for i, person in enumerate(tiny_store.index["subjects"])]
+    with pytest.raises(ValueError, match="1 training subjects, expected 4 or more"):
+        fit_models.check(tiny_store._replace(index=tiny_store.index | {"subjects": people}))
+    without = tuple(s for s in tiny_store.sequences if s.label != "fear")
+    with pytest.raises(ValueError, match="got 17, none of fear"):
+        fit_models.check(tiny_store._replace(sequences=without))
+
+
+def test_the_command_trains_and_says_what_it_made(few, tiny_store, tmp_path, monkeypatch, capsys):
+    given = {}
+
+    def fit(data, folder, *, plans, seed):
+        given.update(data=data.path, folder=folder, plans=plans, seed=seed)
+        return pipeline.load()
+
+    monkeypatch.setattr(fit_models, "fit", fit)
+    monkeypatch.setattr(fit_models, "judge", lambda models, data: {"head": 0.0123, "face": 0.0456})
+    out = tmp_path / "new" / "m.safetensors"
+    cli.main(["fit", "--data", str(tiny_store.path), "--out", str(out), "--quick", "--seed", "3"])
+    assert "0.012 mm over the mesh, 0.046 mm over the face" in capsys.readouterr().out
+    assert (
+        given["seed"] == 3 and given["folder"] == out.with_suffix(".training") and given["plans"].residual.steps == 50
+    )
+    assert pipeline.load(out).about["error_mm"] == {"head": 0.0123, "face": 0.0456}
+    for bad, said in (
+        (["--data", str(tmp_path / "no")], "index.json cannot be read"),
+        (["--out", "m.bin"], ".safetensors"),
+    ):
+        words = {"--data": str(tiny_store.path), "--out": str(out)} | dict([bad])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main(["fit", *[word for pair in words.items() for word in pair]])
+        assert stopped.value.code == 2 and said in capsys.readouterr().err
+
+
+def test_data_of_a_spec_is_told(models):
+    assert models.about["spec"]["level"] == 1 and models.about["data"] == "makehuman4d"
+    assert json.dumps(models.about) and makehuman4d.VERSION == 1
