@@ -8,7 +8,7 @@ region alone, since a scalp that never moves flatters everybody. OT23's own figu
 errors. Every method chooses the weights of its priors by cross-validation within the training meshes, on what the
 split leaves out.
 
-Steps of training: S2D-Dec 12,000 of batch 16, Neural3DMM 4,000, the residual decoder 2,500. `--paper` trains all for
+Steps of training: S2D-Dec 12,000 of batch 16, Neural3DMM 3,000, the residual decoder 2,500. `--paper` trains all for
 300 epochs, days on 2 cores; `--quick` is a look on a small dataset, minutes. A stopped run goes on. `--methods` and
 `--splits` pick; two processes may work on different methods in one folder. About three hours on 2 cores, 30 minutes
 without networks."""

@@ -56,7 +56,7 @@ class Distances(NamedTuple):
         return mean, float(np.sqrt(max(square - mean**2, 0.0)))
 
     def cumulative(self) -> np.ndarray:
-        """The share of each region's vertices x meshes that err by less than each of EDGES, (R, len(EDGES))."""
+        """The share of each region's vertices x meshes that err by no more than each of EDGES, (R, len(EDGES))."""
         return np.cumsum(self.histogram, axis=1)[:, :-1] / self.histogram.sum(axis=1, keepdims=True)
 
 

@@ -23,7 +23,8 @@ from facejax.models import gpmm, linear, residual
 
 BATCH = 16
 FACES = 8  # remembered
-_prepared: OrderedDict[tuple[int, str], linear.Params] = OrderedDict()
+# What was asked for last: the model and its map of a face, by the model's identity and the face's bytes.
+_prepared: OrderedDict[tuple[int, str], tuple[gpmm.Params, linear.Params]] = OrderedDict()
 
 
 class Params(NamedTuple):
@@ -54,13 +55,14 @@ def apply(params: Params, displacements: jax.Array, neutral: np.ndarray) -> jax.
 
 def on_face(base: gpmm.Params, neutral: np.ndarray) -> linear.Params:
     """`gpmm.on_face`, remembered."""
-    key = id(base.statistics), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest()
+    key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest()
     if key not in _prepared:
-        _prepared[key] = gpmm.on_face(base, neutral)
+        # The model is kept with its answer: no other can then have its identity.
+        _prepared[key] = base, gpmm.on_face(base, neutral)
         while len(_prepared) > FACES:
             _prepared.popitem(last=False)
     _prepared.move_to_end(key)
-    return _prepared[key]
+    return _prepared[key][1]
 
 
 def refine(params: Params, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:

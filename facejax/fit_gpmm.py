@@ -74,7 +74,9 @@ def fit(
         for rows in held:
             fit_on = np.setdiff1d(np.arange(train.count), rows)[::2]
             _, motion = gpmm.survey(_People(train.rows(fit_on)))
-            known = gpmm.learn(learnt[kind].only(fit_on), carried=kind, components=3 * components // 4, passes=2)
+            known = gpmm.learn(
+                learnt[kind].only(fit_on), carried=kind, components=max(1, 3 * components // 4), passes=2
+            )
             params = gpmm.Params(faces, at, face, motion, hold, known, gpmm.Prior(kind))
             models[kind].append((params, rows))
             total = total + _errors(params, train, rows)

@@ -23,7 +23,7 @@ BATCH = 16
 class Plan(NamedTuple):
     """How it is trained: L_pr alone (Otberdout et al. 2023, 4.2), otherwise as S2D-Dec."""
 
-    steps: int = 4_000
+    steps: int = 3_000
     batch: int = BATCH
     rate: float = 1e-3  # decays to zero along a cosine
     weight_decay: float = 5e-5
@@ -89,7 +89,7 @@ def fit(
 
 def apply(fitted: Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     """Vertex displacements (T, N, 3) of one face (N, 3) from its landmarks' (T, L, 3)."""
-    found = []
+    found = [np.empty((0, *np.shape(neutral)), np.float32)]
     for low in range(0, len(displacements), BATCH):
         marks = np.asarray(displacements[low : low + BATCH], np.float32)
         rest = jnp.broadcast_to(jnp.asarray(neutral, jnp.float32), (len(marks), *np.shape(neutral)))

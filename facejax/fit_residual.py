@@ -1,8 +1,9 @@
 """Training the decoder of residuals on top of the best linear answer.
 
-The morphable model is chosen and fitted first (`facejax.fit_gpmm`). The network is trained on what its cross-
-validated answers leave over, which is what it will meet on new faces; a fourth of the people (or labels) is kept to
-choose the gate. Files in the folder: `base.npy` holds those answers, and goes when training is done."""
+The morphable model is chosen and fitted first (`facejax.fit_gpmm`). The network is trained on what its cross-validated
+answers leave over, which is what it will meet on new faces; a fourth of the people (or labels) is kept to choose the
+gate. A run goes on from its checkpoints; a finished one is read from `network.safetensors`.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +51,9 @@ def fit(
     """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit."""
     folder, data = Path(folder), train.data
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
-    claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
-    journal.claim(folder, claim)
     base = base or fit_gpmm.fit(train, by=by)
+    claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
+    journal.claim(folder, claim | {"base": base.params.prior._asdict()})
     tables = jax.device_put(strain.around(np.asarray(data.faces), len(base.params.face)))
     hierarchy = jax.device_put(hierarchy)
     done = folder / "network.safetensors"

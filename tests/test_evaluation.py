@@ -1,11 +1,12 @@
-"""Scores of expression networks: nothing is missed by the truth, and the rivals are what they say they are."""
+"""Distances of meshes are the plain loop's; of expression networks' scores, the truth misses nothing."""
 
 import numpy as np
 import pytest
 
 from facejax import evaluation
 from facejax.data import sequences
-from facejax.models import sequence
+from facejax.data.meshes import of_split
+from facejax.models import linear, sequence
 
 L, F = 4, 14
 
@@ -81,3 +82,95 @@ def test_the_mean_sequence_has_room_for_longer_ones():
     mean = evaluation.mean_sequence(train, F + 4)
     assert mean.curve.shape == (F + 4, L, 3) and mean.steps.shape == (F + 3, L, 3)
     np.testing.assert_allclose(mean.curve[F:], np.repeat(mean.curve[F - 1 : F], 4, axis=0), rtol=1e-5)
+
+
+def halved(landmarks, neutral):
+    """A poor method: all vertices go along with the mean landmark, by half."""
+    return neutral + 0.5 * landmarks.mean(axis=1, keepdims=True)
+
+
+def masks(data):
+    upper = data.neutral[0][:, 2] > 0
+    return {"all": np.ones_like(upper), "upper": upper}
+
+
+def test_distances_are_those_of_the_plain_loop(ball_store):
+    test, regions = of_split(ball_store, "test", "validation"), masks(ball_store)
+    found = evaluation.distances(halved, test, regions)
+    off = []
+    for i in range(test.count):
+        marks, vertices = (part[0] for part in test.read(np.array([i])))
+        off.append([np.linalg.norm(0.5 * marks.mean(axis=0) - vertex) for vertex in vertices])
+    off = np.asarray(off)
+    assert found.count == test.count
+    np.testing.assert_allclose(found.total, off.sum(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found.squares, (off**2).sum(axis=0), rtol=1e-5)
+    curves = found.cumulative()
+    for row, mask in zip(curves, regions.values(), strict=True):
+        assert found.mean_std(mask) == pytest.approx((off[:, mask].mean(), off[:, mask].std()), rel=1e-5)
+        # A distance that lies on an edge but for rounding may fall on either side of it.
+        expected = [np.mean(off[:, mask] < edge) for edge in evaluation.EDGES]
+        np.testing.assert_allclose(row, expected, atol=2 / off[:, mask].size)
+
+
+def test_cumulative_curves_rise_to_one(ball_store):
+    test, regions = of_split(ball_store, "test"), masks(ball_store)
+    truth = test.person(test.subjects[0])[2]
+    found = evaluation.distances(lambda marks, neutral: neutral + 0.8 * truth, test, regions).cumulative()
+    assert found.shape == (2, len(evaluation.EDGES)) and np.all(np.diff(found, axis=1) >= 0)
+    np.testing.assert_array_equal(found[:, -1], 1)
+    assert 0 < found[0, 100] < 1
+    far = evaluation.distances(lambda marks, neutral: neutral + truth + 50, test, regions)
+    assert not far.cumulative().any()  # all beyond the last edge
+
+
+def test_parts_add_up_to_the_whole(ball_store):
+    test, regions = of_split(ball_store, "test", "validation"), masks(ball_store)
+    whole = evaluation.distances(halved, test, regions)
+    a, b = (evaluation.distances(halved, test.where(np.arange(test.count) % 2 == i), regions) for i in (0, 1))
+    for found, expected in zip(a.add(b), whole, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_truth_is_off_by_the_landmarks_noise_alone(ball_store):
+    test, regions = of_split(ball_store, "test"), masks(ball_store)
+    at = ball_store.landmark_index
+
+    def met(landmarks, neutral):
+        """The given landmarks where they are, and the truth elsewhere."""
+        moved = test.person(test.subjects[0])[2].copy()
+        moved[:, at] = landmarks
+        return neutral + moved
+
+    assert evaluation.distances(met, test, regions).mean_std(regions["all"])[0] == pytest.approx(0, abs=1e-5)
+    found = [evaluation.distances(met, test, regions, noise=0.7, seed=seed) for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(found[0].total, found[1].total)
+    assert not np.array_equal(found[0].total, found[2].total)
+    # The mean square of three coordinates' noise.
+    mean_square = sum(each.squares[at].mean() / each.count for each in found[1:]) / 2
+    assert mean_square == pytest.approx(3 * 0.7**2, rel=0.2)
+    elsewhere = np.setdiff1d(np.arange(len(found[0].total)), at)
+    np.testing.assert_allclose(found[0].total[elsewhere], 0, atol=1e-3)
+
+
+def test_distances_of_nothing_are_refused(ball_store):
+    nobody = of_split(ball_store, "test").rows(np.zeros(0, int))
+    with pytest.raises(ValueError, match="meshes to measure on, got none"):
+        evaluation.distances(halved, nobody, masks(ball_store))
+
+
+@pytest.mark.parametrize("by", ["subjects", "labels"])
+def test_linear_maps_take_the_alpha_that_held_out_groups_like_best(ball_store, by):
+    train = of_split(ball_store, "train")
+    params, alpha = evaluation.fit_linear(linear.ridge, train, by=by)
+    errors = np.zeros(len(evaluation.ALPHAS))
+    thin = train.rows(np.arange(0, train.count, 3))
+    of = thin.owner if by == "subjects" else thin.labels
+    for group in np.unique(of):  # four of either, and four folds
+        known, held_out = thin.where(of != group), thin.where(of == group)
+        for i, candidate in enumerate(evaluation.ALPHAS):
+            fitted = linear.ridge.fit(known, alpha=candidate)
+            errors[i] += sum(np.linalg.norm(linear.apply(fitted, m) - v, axis=-1).sum() for m, v in held_out)
+    assert alpha == evaluation.ALPHAS[int(np.argmin(errors))]
+    expected = linear.ridge.fit(train, alpha=alpha)
+    np.testing.assert_array_equal(params.factors[0], expected.factors[0])

@@ -72,6 +72,15 @@ def test_a_face_is_worked_out_once_and_the_last_few_are_remembered(params, perso
     assert len(asked) == 4
 
 
+def test_another_prior_is_another_model(params, person):
+    neutral, marks, _ = person
+    closed = params._replace(network=params.network._replace(gate=jnp.zeros(())))
+    first = np.asarray(expand.apply(closed, marks, neutral))
+    doubtful = closed.base._replace(prior=closed.base.prior._replace(noise=10.0))
+    assert np.abs(np.asarray(expand.apply(closed._replace(base=doubtful), marks, neutral)) - first).max() > 0.1
+    np.testing.assert_array_equal(expand.apply(closed, marks, neutral), first)
+
+
 def test_a_traced_face_is_refused(params, person):
     neutral, marks, _ = person
     with pytest.raises(ValueError, match="every face is prepared on the host"):

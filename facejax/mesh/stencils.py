@@ -33,9 +33,12 @@ class Stencil(NamedTuple):
 
 
 def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
-    """The maps of spirals (V, S) on a signal lifted by corners and weights (V, K) from `coarse` vertices."""
-    count, length = spirals.shape
-    real = spirals < count
+    """The maps of spirals (V, S) on a signal of W vertices, lifted by corners and weights (W, K) from `coarse` ones.
+
+    Usually V = W: the spirals of all. W marks the dummy vertex, which reads zero.
+    """
+    length = spirals.shape[1]
+    real = spirals < len(corners)  # of all vertices, though the spirals may be those of some alone
     spirals = np.where(real, spirals, 0)
     source = np.transpose(corners[spirals], (1, 2, 0))
     weight = np.transpose(weights[spirals] * real[..., None], (1, 2, 0)).astype(np.float32)

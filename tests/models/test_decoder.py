@@ -144,11 +144,37 @@ def test_same_shapes_trace_once():
     assert decoder.apply._cache_size() == before
 
 
+def test_expanding_is_climbing_and_one_convolution_more():
+    weights = decoder.init_weights(jax.random.key(1), HIERARCHY, inputs=6, channels=CHANNELS, outputs=7)
+    x = array(3, 2, 6)
+    climb = jax.jit(decoder.climb)
+    climbed = climb(weights, HIERARCHY, x)
+    assert climbed.shape == (len(VERTICES), 2, CHANNELS[-1])
+    found = jax.jit(decoder.expand)(weights, HIERARCHY, x)
+    for i in range(2):
+        expected = plain_conv(climbed[:, i], HIERARCHY.spirals[0], weights["convs"][-1])
+        np.testing.assert_allclose(found[:, i], expected, rtol=1e-4, atol=1e-4)
+    # Weights without outputs are those of the climb alone, drawn alike.
+    bare = decoder.init_weights(jax.random.key(1), HIERARCHY, inputs=6, channels=CHANNELS, outputs=None)
+    assert len(bare["convs"]) == len(CHANNELS) - 1 == len(weights["convs"]) - 1
+    np.testing.assert_allclose(climb(bare, HIERARCHY, x), climbed, atol=1e-5)
+
+
+def test_a_decoder_starts_with_a_quiet_last_convolution():
+    params = decoder.init(jax.random.key(1), HIERARCHY, landmarks=L, channels=CHANNELS)
+    drawn = decoder.init_weights(jax.random.key(1), HIERARCHY, inputs=3 * L, channels=CHANNELS, outputs=3)
+    drawn["convs"][-1]["kernel"] *= 0.01
+    for a, b in zip(jax.tree.leaves(params.weights), jax.tree.leaves(drawn), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_wrong_sizes_are_named():
     with pytest.raises(ValueError, match=r"expected \(\.\.\., 5, 3\), got \(2, 4, 3\)"):
         decoder.apply(parameters(), HIERARCHY, jnp.zeros((2, 4, 3)))
     with pytest.raises(ValueError, match="channels: expected 3"):
         decoder.init(jax.random.key(0), HIERARCHY, channels=(8, 4))
+    with pytest.raises(ValueError, match="channels: expected 3 for this hierarchy, got 4"):
+        decoder.init_weights(jax.random.key(0), HIERARCHY, inputs=6, channels=(8, 4, 4, 2), outputs=None)
 
 
 def test_the_head_has_the_papers_layers(template):

@@ -116,6 +116,46 @@ def test_eager_jit_and_vmap_agree(lead):
     np.testing.assert_allclose(mapped(params, x), found, atol=1e-5)
 
 
+@pytest.mark.parametrize("inner", [(), (5,), (5, 2)], ids=["one", "two", "three"])
+def test_affine_parameters_are_means_and_a_product_in_single_precision(inner):
+    rng = np.random.default_rng(0)
+    sizes = (3 * L, *inner, 3 * N)
+    factors = [rng.normal(size=shape) for shape in zip(sizes[:-1], sizes[1:], strict=True)]
+    means, x = (rng.normal(size=(L, 3)), rng.normal(size=(N, 3))), rng.normal(size=(7, L, 3))
+    params = linear.affine(*means, *factors)
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(params)} == {"float32"} and len(params.factors) == len(factors)
+    whole = factors[0] if len(factors) == 1 else np.linalg.multi_dot(factors)
+    expected = means[1] + ((x - means[0]).reshape(7, -1) @ whole).reshape(7, N, 3)
+    np.testing.assert_allclose(linear.apply(params, jnp.asarray(x, jnp.float32)), expected, rtol=1e-4, atol=1e-3)
+
+
+def test_a_model_of_two_halves_fits_in_one_and_can_be_chosen():
+    def prepare(batches, *, scale):
+        return scale * sum(len(landmarks) for landmarks, _ in batches)
+
+    def solve(prepared, *, alpha):
+        linear.check_alpha(alpha)
+        return linear.affine(np.zeros((L, 3)), np.full((N, 3), prepared + alpha), np.zeros((3 * L, 3 * N)))
+
+    counting = linear.model(prepare, solve)
+    assert (counting.prepare, counting.solve) == (prepare, solve)
+    assert (counting.fit(split(faces()), alpha=0.5, scale=2).vertex_mean == 2 * FRAMES + 0.5).all()
+    held_out = (np.zeros((3, L, 3)), np.full((3, N, 3), FRAMES + 7.0))
+    alphas = [1.0, 5.0, 8.0, 90.0]
+    best, errors = linear.choose(counting, [([faces()], [held_out])], alphas, scale=1)
+    np.testing.assert_allclose(errors, np.sqrt(3) * np.abs(np.array(alphas) - 7), rtol=1e-5)
+    assert best == 8.0
+
+
+@pytest.mark.parametrize("alpha", [-1e-9, -1.0, np.nan])
+def test_a_regularisation_below_zero_is_refused(alpha):
+    for known in (linear.ridge, linear.pca):
+        options = {"components": 2} if known is linear.pca else {}
+        with pytest.raises(ValueError, match="alpha: expected 0 or more"):
+            known.fit([faces()], alpha=alpha, **options)
+    linear.check_alpha(0.0)
+
+
 def test_wrong_input_is_named():
     landmarks, vertices = faces()
     with pytest.raises(ValueError, match="alpha: expected 0 or more, got -1"):
