@@ -3,7 +3,8 @@
     python -m experiments.figure6 --publish
 
 The first fold of people of `experiments.table1`, whose folder is read for what was trained there. For each face
-shown, the frame with the strongest motion of its expression; blue is no error, red the same distance for all.
+shown, the frame with the strongest motion of its expression; white is no error, the darkest red `--high` millimetres
+or more.
 """
 
 from __future__ import annotations
