@@ -32,6 +32,7 @@ import matplotlib.pyplot as plt
 
 METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "gpmm", "s2d_residual", "s2d", "neural3dmm")
 WINDOW = 20  # frames
+LEVEL = 3  # realism of what is learnt from
 PAPER = {"pca220": 2.90, "dl3dmm": 2.73, "neural3dmm": 3.49, "s2d": 1.48}  # OT23, Table 2, VOCASET, mm
 
 
@@ -63,7 +64,7 @@ def run(config: Config) -> dict[str, Any]:
     """One row per method and region."""
     mode = _dense.mode_of(config)
     _dense.check_methods(config.methods)
-    data = _cases.data_of(None, mode)
+    data = _cases.data_of(None, mode, level=LEVEL)
     regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
     train = _cases.at_most(of_split(data, "train", "validation").of_labels(performance.COMA))
     case = _cases.Case("speech", 0, train, train, "labels")

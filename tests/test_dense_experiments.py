@@ -27,10 +27,11 @@ def tiny(own_cache, monkeypatch):  # noqa: F811
 
 
 def test_table1_has_a_row_for_each_and_goes_on(tiny, tmp_path, monkeypatch):
-    table1.run(table1.Config(out=tmp_path / "o", quick=True, methods=("s2d",), splits=("test",)))
+    small = {"quick": True, "level": 1}
+    table1.run(table1.Config(out=tmp_path / "o", methods=("s2d",), splits=("test",), **small))
     rows = check(tmp_path / "o", "rows")["rows"]
     assert [r["region"] for r in rows] == ["head", "face"] and rows[0]["chosen"] == [{"steps": 2}]
-    config = table1.Config(out=tmp_path / "o", quick=True, methods=("ridge", "rbf"), splits=("identity", "test"))
+    config = table1.Config(out=tmp_path / "o", methods=("ridge", "rbf"), splits=("identity", "test"), **small)
     table1.run(config)
     metrics = check(tmp_path / "o", "rows", "mode", "paper_mm")
     rows = metrics["rows"]
@@ -46,9 +47,7 @@ def test_table1_has_a_row_for_each_and_goes_on(tiny, tmp_path, monkeypatch):
     assert json.loads((tmp_path / "o" / "metrics.json").read_text())["rows"] == rows
     # The curves are of the same results.
     curves = figure5.run(
-        figure5.Config(
-            out=tmp_path / "f", runs=tmp_path / "o", quick=True, methods=config.methods, splits=("identity",)
-        )
+        figure5.Config(out=tmp_path / "f", runs=tmp_path / "o", methods=config.methods, splits=("identity",), **small)
     )["curves"]
     check(tmp_path / "f", "edges_mm", "curves")
     assert len(curves) == 4 and all(np.all(np.diff(c["share"]) >= 0) and c["share"][-1] > 0.99 for c in curves)
@@ -119,7 +118,8 @@ def test_published_splits(tiny_store, name, identity, expression):
         assert set(held) == set(range(identity))
 
 
-def test_table3_in_both_directions(tiny, tmp_path):
+def test_table3_in_both_directions(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(table3, "LEVEL", 0)
     found = table3.run(table3.Config(out=tmp_path / "o", quick=True, methods=("ridge",)))
     check(tmp_path / "o", "rows", "paper_mm")
     errors = {r["direction"]: r["mean_mm"] for r in found["rows"] if r["region"] == "head"}
@@ -129,12 +129,14 @@ def test_table3_in_both_directions(tiny, tmp_path):
 
 def test_table4_trains_each_variant(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(table4, "VARIANTS", {name: table4.VARIANTS[name] for name in ("S1", "S3, inverse, reference")})
-    found = table4.run(table4.Config(out=tmp_path / "o", quick=True))
+    found = table4.run(table4.Config(out=tmp_path / "o", quick=True, level=0))
     check(tmp_path / "o", "rows", "paper_mm")
     assert len({r["mean_mm"] for r in found["rows"]}) == 4
 
 
-def test_nonlinearity_with_noise_and_floor(tiny, tmp_path):
+def test_nonlinearity_with_noise_and_floor(tiny, tmp_path, monkeypatch):
+    # Two people to judge: what landmarks leave open is seen between people.
+    monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
     config = nonlinearity.Config(
         out=tmp_path / "o", quick=True, levels=(0,), noises=(0.0,), methods=("ridge",), splits=("test",)
     )
@@ -153,6 +155,7 @@ def test_table2_carries_a_recording_to_others(tiny, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="--people: expected 1 to 0"):
         table2.run(config)
     monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
+    monkeypatch.setattr(table2, "LEVEL", 0)
     rows = {(r["method"], r["region"]): r for r in table2.run(config)["rows"]}
     check(tmp_path / "o", "rows", "window")
     assert rows["rbf", "face"]["own_mm"] < rows["still", "face"]["own_mm"]
@@ -162,7 +165,9 @@ def test_table2_carries_a_recording_to_others(tiny, tmp_path, monkeypatch):
 
 
 def test_figures_of_faces(tiny, tmp_path):
-    found = figure6.run(figure6.Config(out=tmp_path / "a", runs=tmp_path / "r", quick=True, methods=("still", "rbf")))
+    found = figure6.run(
+        figure6.Config(out=tmp_path / "a", runs=tmp_path / "r", quick=True, level=0, methods=("still", "rbf"))
+    )
     check(tmp_path / "a", "rows", "red_mm")
     errors = {m: np.mean([r["mean_mm"] for r in found["rows"] if r["method"] == m]) for m in ("still", "rbf")}
     assert errors["rbf"] < errors["still"] and (tmp_path / "a" / "figure6.png").exists()
