@@ -1,8 +1,8 @@
 """Choosing the prior of the morphable model by cross-validation, and its answers on faces that it was not fitted to.
 
     found = fit_gpmm.fit(train, by="subjects")
-    found.params       # fitted to all of `train` under the best prior
-    found.held_out     # for every mesh of `train`, what a model answers that saw neither its person (or its label)
+    found.params           # fitted to all of `train` under the best prior
+    found.held_out(train)  # for every mesh, what a model answers that never saw its person (or its label)
 
 Hold out what will be new at test time: people, or expressions. Part of the choice is whether displacements are carried
 from face to face, and how strong the smooth prior is; both can come out as none, which is ridge regression.

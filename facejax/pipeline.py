@@ -68,7 +68,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
         tree["hierarchy"] = topology.load(tree["hierarchy"])
         if about.get("decoder", S2D) == REFINED:
             tree["decoder"] = expand.unpack(tree["decoder"], tree["hierarchy"], tree["face"].faces)
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path}: {error}") from error
     # The face and its props stay on the host: they are read by exporters, not by networks.
     networks = ["motion", "starts", "hierarchy"]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 
 from facejax import expand, fit_gpmm
 from facejax.data.meshes import of_split
@@ -96,6 +97,30 @@ def test_a_file_holds_all_to_half_precision(ball_store, person, carried):
     neutral, marks, _ = person
     found, expected = (np.asarray(expand.apply(p, marks, neutral)) for p in (again, params))
     assert np.abs(found - expected).max() < 5e-3 * np.abs(expected).max()
+
+
+def test_a_file_of_linear_data_is_as_good_as_the_model():
+    """The landmarks move in fewer directions than they have coordinates, and nothing is noise."""
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    rest, faces, marks = (
+        50 * np.asarray(ball.vertices),
+        np.asarray(ball.faces, np.int32),
+        np.array([0, 20, 61, 99, 140]),
+    )
+    shapes = rng.normal(size=(6, *rest.shape)) * 10.0 ** -np.arange(6.0)[:, None, None]
+    moved = np.einsum("fk,knx->fnx", rng.normal(size=(80, 6)), shapes)
+    prior = gpmm.Prior(carried=False, smooth=0.0, noise=1e-12)
+    base = gpmm.fit([gpmm.Person(rest, moved[:, marks], moved)], faces, marks, prior=prior)
+    hierarchy = topology.build(rest, faces, factors=(2, 2, 2, 2), lengths=3)
+    one = jnp.ones(())
+    network = residual.init(
+        jax.random.key(0), hierarchy, residual.Scale(jnp.asarray(rest), jnp.zeros((5, 3)), one, one)
+    )
+    params = expand.Params(base, network, hierarchy, strain.around(faces, len(rest)))
+    again = expand.unpack(jax.tree.map(np.asarray, expand.pack(params)), hierarchy, faces)
+    errors = [np.abs(np.asarray(expand.apply(p, moved[:, marks], rest)) - moved).max() for p in (params, again)]
+    assert errors[0] < 1e-3 and errors[1] < 1.5 * errors[0]
 
 
 def test_fewer_components_weigh_less(params):

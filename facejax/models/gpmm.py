@@ -6,7 +6,7 @@ as far as it usually moves. The most probable displacement given the landmarks',
 affine map; it differs from face to face where the covariance was learnt on a mean face and is *carried* to the given
 one by deformation transfer (`facejax.mesh.transfer`). Plain, and without the smooth prior, it is ridge regression.
 
-    params = gpmm.fit(people, faces, landmark_index, carried=True, smooth=0.01, noise=1e-4)
+    params = gpmm.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
     mine = gpmm.on_face(params, neutral)  # once per face, half a second
     displacements = linear.apply(mine, landmark_displacements)
 
@@ -54,7 +54,8 @@ class Params(NamedTuple):
     face: np.ndarray  # (N, 3)
     motion: np.ndarray  # (N,) how far each vertex moves, root mean square in mm: the smooth prior's measure
     hold: np.ndarray  # (N,) the same, as the carrier between faces was given it
-    statistics: linear.Basis | linear.Moments  # carried: a basis on the mean face; plain: moments as they are
+    # Carried: a basis on the mean face. Plain: moments as they are, or the map itself, the same for all faces.
+    statistics: linear.Basis | linear.Moments | linear.Params
     prior: Prior
 
 
@@ -106,8 +107,10 @@ def carry_to(person: Person, faces: np.ndarray, face: np.ndarray, hold: np.ndarr
 
 def on_face(params: Params, neutral: np.ndarray) -> linear.Params:
     """The map of one face (N, 3): what `linear.apply` takes. Raises `ValueError` for a face of another shape."""
-    known, prior = covariances(params, neutral), params.prior
-    here, there = _posterior(known, prior)
+    if isinstance(params.statistics, linear.Params):
+        _check(params, neutral)
+        return params.statistics
+    here, there = _posterior(known := covariances(params, neutral), params.prior)
     return linear.affine(known.mean[params.landmark_index], known.mean, np.linalg.solve(here, there))
 
 
@@ -124,8 +127,7 @@ class Covariances(NamedTuple):
 
 def covariances(params: Params, neutral: np.ndarray, *, only: np.ndarray | None = None) -> Covariances:
     """Of one face (N, 3): all vertices, or `only` (V,). Raises `ValueError` for a face of another shape."""
-    if np.shape(neutral) != params.face.shape:
-        raise ValueError(f"neutral: expected vertices {params.face.shape}, got {np.shape(neutral)}")
+    _check(params, neutral)
     at = params.landmark_index
     keep = np.arange(len(params.face)) if only is None else only
     mean, within, cross = _learnt(params, neutral, keep)
@@ -139,6 +141,11 @@ def answer(known: Covariances, prior: Prior, landmarks: np.ndarray) -> np.ndarra
     here, there = _posterior(known, prior)
     off = (landmarks - known.landmark_mean).reshape(len(landmarks), -1)
     return known.mean + (np.linalg.solve(here, off.T).T @ there).reshape(len(landmarks), -1, 3)
+
+
+def _check(params: Params, neutral: np.ndarray) -> None:
+    if np.shape(neutral) != params.face.shape:
+        raise ValueError(f"neutral: expected vertices {params.face.shape}, got {np.shape(neutral)}")
 
 
 def _posterior(known: Covariances, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
