@@ -10,10 +10,9 @@ import numpy as np
 
 from facejax.data import cache, makehuman, makehuman4d, performance, store
 from facejax.data.meshes import Meshes, of_split
-from facejax.mesh import graph, topology
+from facejax.mesh import attachment, topology
 
 MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
-FACE_REACH = 25.0  # mm along the surface
 FOLDS = 4
 QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
 Mode = Literal["quick", "default", "paper"]
@@ -34,7 +33,9 @@ class Case(NamedTuple):
         return f"{self.split}-{self.fold}"
 
 
-def data_of(path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED):
+def data_of(
+    path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED
+) -> store.Store:
     """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
     if path is not None:
         return store.open_store(path)
@@ -125,14 +126,17 @@ def regions_of(data: store.Store) -> dict[str, np.ndarray]:
     if is_makehuman(data):
         mask = makehuman.template().face_mask
     else:
-        mean = np.asarray(data.neutral, np.float64).mean(axis=0)
-        mask = graph.geodesic(mean, np.asarray(data.faces), np.asarray(data.landmark_index)) <= FACE_REACH
+        mask = attachment.region(_template(data), np.asarray(data.faces), np.asarray(data.landmark_index))
     return {"head": np.ones_like(mask), "face": mask}
 
 
 def hierarchy_of(data: store.Store) -> topology.Hierarchy:
     """The levels that spiral networks climb."""
-    template = (
-        makehuman.template().vertices if is_makehuman(data) else np.asarray(data.neutral, np.float64).mean(axis=0)
-    )
-    return topology.build(template, np.asarray(data.faces), cache=cache.folder())
+    return topology.build(_template(data), np.asarray(data.faces), cache=cache.folder())
+
+
+def _template(data: store.Store) -> np.ndarray:
+    """The face on which tables are made: makehuman4d's own, else the mean of the training subjects."""
+    if is_makehuman(data):
+        return makehuman.template().vertices
+    return np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0)

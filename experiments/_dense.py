@@ -6,6 +6,7 @@ that a comparison that was stopped goes on, and one method can be added later.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import time
@@ -33,6 +34,34 @@ NAMES = {
     "rbf": "RBF",
     "still": "left still",
 }
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Of every experiment on landmarks -> mesh."""
+
+    out: Path = Path("runs")
+    """Folder for checkpoints and results."""
+    seed: int = 0
+    """Of the networks."""
+    quick: bool = False
+    """A look: small datasets and few steps."""
+    paper: bool = False
+    """Train for the paper's 300 epochs."""
+    publish: bool = False
+    """Also write the figures that the README quotes."""
+
+    @property
+    def mode(self) -> Mode:
+        """How thorough. Raises `ValueError` where two are asked for."""
+        if self.quick and self.paper:
+            raise ValueError("--quick and --paper: name one of them")
+        return "quick" if self.quick else "paper" if self.paper else "default"
+
+    def folder(self, out: Path | None = None) -> Path:
+        """Where checkpoints lie: a look and the real thing do not go on from one another."""
+        out = self.out if out is None else out
+        return out if self.mode == "default" else out / self.mode
 
 
 class Result(NamedTuple):
@@ -184,13 +213,6 @@ def drawn(figure: Any, path: Path) -> Path:
         figure.savefig(temporary, dpi=110, format="png")
     pyplot.close(figure)
     return path
-
-
-def mode_of(config: Any) -> Mode:
-    """Of a config with `quick` and `paper`."""
-    if config.quick and config.paper:
-        raise ValueError("--quick and --paper: name one of them")
-    return "quick" if config.quick else "paper" if config.paper else "default"
 
 
 def check_methods(names: Sequence[str]) -> None:

@@ -26,13 +26,11 @@ SHOWN = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # mm
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_dense.Options):
     out: Path = Path("runs/figure5")
     """Folder for the results."""
     runs: Path = Path("runs/table1")
     """Folder of `experiments.table1`."""
-    seed: int = 0
-    """Of the networks."""
     data: Path | None = None
     """A prepared dataset in place of makehuman4d."""
     level: int = 3
@@ -41,17 +39,11 @@ class Config:
     """Which methods."""
     splits: tuple[str, ...] = ("expression", "identity")
     """Which protocols."""
-    quick: bool = False
-    """A look: a small dataset and few steps."""
-    paper: bool = False
-    """Trained for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """The share of vertices below each distance, per split, region and method."""
-    mode = _dense.mode_of(config)
+    mode = config.mode
     _dense.check_methods(config.methods)
     data = _cases.data_of(config.data, mode, level=config.level)
     regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
@@ -59,9 +51,13 @@ def run(config: Config) -> dict[str, Any]:
     for split in config.splits:
         for name in config.methods:
             parts = [
-                _dense.judge(name, case, config.runs, _dense.options_of(case, mode, config.seed, hierarchy), regions)[
-                    0.0
-                ]
+                _dense.judge(
+                    name,
+                    case,
+                    config.folder(config.runs),
+                    _dense.options_of(case, mode, config.seed, hierarchy),
+                    regions,
+                )[0.0]
                 for case in _cases.cases(data, [split])
             ]
             seconds += sum(part.seconds for part in parts)

@@ -28,13 +28,11 @@ PICTURE = (170, 214)
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_dense.Options):
     out: Path = Path("runs/figure6")
     """Folder for the results."""
     runs: Path = Path("runs/table1")
     """Folder of `experiments.table1`."""
-    seed: int = 0
-    """Of the networks."""
     data: Path | None = None
     """A prepared dataset in place of makehuman4d."""
     level: int = 3
@@ -43,17 +41,11 @@ class Config:
     """Which methods."""
     high: float = HIGH
     """What is drawn red, mm."""
-    quick: bool = False
-    """A look: a small dataset and few steps."""
-    paper: bool = False
-    """Trained for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the picture that the README shows."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """A sheet: one row per face, the truth and then each method; and each one's mean error."""
-    mode, begun = _dense.mode_of(config), time.perf_counter()
+    mode, begun = config.mode, time.perf_counter()
     _dense.check_methods(config.methods)
     data = _cases.data_of(config.data, mode, level=config.level)
     case = _cases.cases(data, ["identity"])[0]
@@ -63,7 +55,7 @@ def run(config: Config) -> dict[str, Any]:
     columns = [[_face(data, vertices) for vertices in true]]
     rows = []
     for name in config.methods:
-        fitted = _dense.fitted(name, case, config.runs, options)
+        fitted = _dense.fitted(name, case, config.folder(config.runs), options)
         column = []
         for row, vertices in zip(chosen, true, strict=True):
             rest = np.asarray(data.neutral[case.test.owner[row]])

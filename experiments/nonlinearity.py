@@ -8,8 +8,8 @@ them. Held-out people (80 train, 20 test) and held-out expressions (the first of
 model that knows how noisy the landmarks are. The floor is what the landmarks leave open (`facejax.floor`): for
 whoever sees landmarks alone, and for whoever sees the person's face as well.
 
-`--quick` is a look, minutes; `--paper` trains for 300 epochs. About four hours on 2 cores, most of them for S2D-Dec;
-a stopped run goes on. `--levels`, `--noises` and `--methods` pick.
+`--quick` is a look; `--paper` trains for 300 epochs. Hours on 2 cores, most of them for the networks; a stopped run
+goes on. `--levels`, `--noises` and `--methods` pick.
 """
 
 from __future__ import annotations
@@ -37,11 +37,9 @@ COLOURS = {"ridge": "#c46b4e", "pca220": "#5b8db8", "rbf": "#999999", "gpmm": "#
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_dense.Options):
     out: Path = Path("runs/nonlinearity")
     """Folder for checkpoints and results."""
-    seed: int = 0
-    """Of the networks."""
     levels: tuple[int, ...] = rig.LEVELS
     """Levels of realism."""
     noises: tuple[float, ...] = (0.0, 0.3)
@@ -52,17 +50,11 @@ class Config:
     """Held-out people, held-out expressions."""
     steps: int = 6_000
     """Of S2D-Dec."""
-    quick: bool = False
-    """A look: small datasets and few steps."""
-    paper: bool = False
-    """Train for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """One row per level, registration noise, landmark noise, split, method and region."""
-    mode = _dense.mode_of(config)
+    mode = config.mode
     _dense.check_methods(config.methods)
     rows, floors, seconds = [], [], 0.0
     for noise in config.noises:
@@ -74,7 +66,7 @@ def run(config: Config) -> dict[str, Any]:
                 where = {"level": level, "noise_mm": noise, "split": split}
                 plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
                 options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
-                folder = config.out / f"level{level}-noise{noise:g}"
+                folder = config.folder() / f"level{level}-noise{noise:g}"
                 for name in config.methods:
                     begun = time.perf_counter()
                     found = _dense.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)

@@ -24,10 +24,9 @@ import jax
 import numpy as np
 
 from experiments import _run
-from facejax import evaluation, fit_decoder, fit_motion, pipeline
+from facejax import evaluation, fit_decoder, fit_models, fit_motion, pipeline
 from facejax.data import assets, cache, makehuman, makehuman4d, motions, performance, store
 from facejax.data.meshes import of_split
-from facejax.io import dress
 from facejax.mesh import topology
 from facejax.models import decoder, generators
 
@@ -93,7 +92,7 @@ def run(config: Config) -> dict[str, Any]:
             assets.load().source_index[: len(shape.vertices)],
             shape.face_mask,
         ),
-        props=_props(shape),
+        props=fit_models.props(),
         motion=generator,
         starts=beginnings,
         hierarchy=hierarchy,
@@ -201,10 +200,6 @@ class _timed:
         _run.write_text(
             self.path, json.dumps(round(self.before + (spent if spent > 30 or not self.before else 0.0), 1))
         )
-
-
-def _props(shape: makehuman.Template) -> dress.Props:
-    return dress.Props(shape.vertices[shape.landmarks], *makehuman.template_props())
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ speech among them. Five passages of the recording. OT23 takes each frame's least
 which flatters; the error frame by frame stands beside it. What the transfer itself costs is told by the methods'
 errors from the person's own landmarks.
 
-`--quick` is a look; `--paper` trains for 300 epochs. About half an hour on 2 cores; a stopped run goes on.
+`--quick` is a look; `--paper` trains for 300 epochs. A stopped run goes on.
 """
 
 from __future__ import annotations
@@ -37,13 +37,11 @@ PAPER = {"pca220": 2.90, "dl3dmm": 2.73, "neural3dmm": 3.49, "s2d": 1.48}  # OT2
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    recording: Path
+class Config(_dense.Options):
+    recording: Path = dataclasses.field(kw_only=True)
     """A recording of Live Link Face (CSV)."""
     out: Path = Path("runs/table2")
     """Folder for checkpoints and results."""
-    seed: int = 0
-    """Of the networks."""
     people: int = 11
     """To how many people the motion is carried."""
     passages: int = 5
@@ -52,17 +50,11 @@ class Config:
     """How long each is."""
     methods: tuple[str, ...] = METHODS
     """Which methods."""
-    quick: bool = False
-    """A look: a small dataset and few steps."""
-    paper: bool = False
-    """Train for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """One row per method and region."""
-    mode = _dense.mode_of(config)
+    mode = config.mode
     _dense.check_methods(config.methods)
     data = _cases.data_of(None, mode, level=LEVEL)
     regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
@@ -79,7 +71,7 @@ def run(config: Config) -> dict[str, Any]:
     moved = {index: [_skin(take, faces[index]) for take in takes] for index in faces}
     rows, begun = [], time.perf_counter()
     for name in config.methods:
-        fitted = _dense.fitted(name, case, config.out, options)
+        fitted = _dense.fitted(name, case, config.folder(), options)
         errors = {"transferred": {}, "own": {}}
         for index in others:
             rest = faces[index].vertices

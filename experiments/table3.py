@@ -8,7 +8,7 @@ direction is judged on all of B, the other on the test set of A. Noise in the tr
 judged against its noise-free meshes as well ("B, clean"). With `--first` and `--second`, two stores of the user's
 own, CoMA and Florence 4D say, in one topology.
 
-`--quick` is a look; `--paper` trains for 300 epochs. About an hour on 2 cores; a stopped run goes on.
+`--quick` is a look; `--paper` trains for 300 epochs. A stopped run goes on.
 """
 
 from __future__ import annotations
@@ -41,28 +41,20 @@ PAPER = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_dense.Options):
     out: Path = Path("runs/table3")
     """Folder for checkpoints and results."""
-    seed: int = 0
-    """Of the networks."""
     first: Path | None = None
     """A prepared dataset in place of A."""
     second: Path | None = None
     """A prepared dataset in place of B."""
     methods: tuple[str, ...] = METHODS
     """Which methods."""
-    quick: bool = False
-    """A look: small datasets and few steps."""
-    paper: bool = False
-    """Train for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """One row per direction, method and region."""
-    mode = _dense.mode_of(config)
+    mode = config.mode
     _dense.check_methods(config.methods)
     a = _cases.data_of(config.first, mode, level=LEVEL, seed=SEEDS[0])
     b = _cases.data_of(config.second, mode, level=LEVEL, seed=SEEDS[1], noise=NOISE)
@@ -82,7 +74,7 @@ def run(config: Config) -> dict[str, Any]:
         for name in config.methods:
             begun = time.perf_counter()
             # What was trained for one direction serves every judgement of it.
-            result = _dense.judge(name, case, config.out, options, regions, trained=source.path.name)[0.0]
+            result = _dense.judge(name, case, config.folder(), options, regions, trained=source.path.name)[0.0]
             seconds += result.seconds
             for region, mask in regions.items():
                 mean, std = result.distances.mean_std(mask)

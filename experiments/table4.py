@@ -8,8 +8,8 @@ there cannot come from the formula. The authors' program swaps the two factors a
 (`reference`), so that the weighted term is some thousand times the other; all are trained with both reductions and
 all three weightings.
 
-On the first quarter of people, trained on the others. 6,000 steps each, `--paper` 300 epochs, `--quick` a look. About
-40 minutes on 2 cores; a stopped run goes on.
+On the first quarter of people, trained on the others. 6,000 steps each, `--paper` 300 epochs, `--quick` a look. A
+stopped run goes on.
 """
 
 from __future__ import annotations
@@ -42,28 +42,20 @@ PAPER = {"S1": (1.27, 1.88), "S2": (0.92, 1.33), "S3, inverse": (0.50, 0.56)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Config(_dense.Options):
     out: Path = Path("runs/table4")
     """Folder for checkpoints and results."""
-    seed: int = 0
-    """Of the networks."""
     data: Path | None = None
     """A prepared dataset in place of makehuman4d."""
     level: int = 3
     """Realism of makehuman4d."""
     steps: int = 6_000
     """Of training."""
-    quick: bool = False
-    """A look: a small dataset and few steps."""
-    paper: bool = False
-    """Train for the paper's 300 epochs."""
-    publish: bool = False
-    """Also write the figures that the README quotes."""
 
 
 def run(config: Config) -> dict[str, Any]:
     """One row per variant and region."""
-    mode = _dense.mode_of(config)
+    mode = config.mode
     data = _cases.data_of(config.data, mode, level=config.level)
     regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
     case = _cases.cases(data, ["identity"])[0]
@@ -73,7 +65,7 @@ def run(config: Config) -> dict[str, Any]:
         options = _dense.options_of(case, mode, config.seed, hierarchy)
         plan = options.decoder if mode != "default" else fit_decoder.Plan(steps=config.steps)
         options = options._replace(decoder=plan._replace(**changes))
-        folder = config.out / name.replace(", ", "-").lower()
+        folder = config.folder() / name.replace(", ", "-").lower()
         result = _dense.judge("s2d", case, folder, options, regions)[0.0]
         seconds += result.seconds
         for region, mask in regions.items():

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax import metrics
 from facejax.data import sequences
 from facejax.data.meshes import Batch, Meshes
 from facejax.models import linear, sequence
@@ -17,25 +16,6 @@ from facejax.models import linear, sequence
 ALPHAS = tuple(10.0**e for e in range(-8, 3))
 FOLDS = 4
 EDGES = np.geomspace(1e-5, 20.0, 253)  # mm, of cumulative curves: forty a decade
-
-
-def vertex_errors(
-    decode: Callable[[np.ndarray], jax.Array], meshes: Iterable[Batch], regions: dict[str, np.ndarray]
-) -> dict[str, dict[str, float]]:
-    """Mean and standard deviation of the vertex distance over vertices x frames, per region (a mask (N,))."""
-    count, total, squares = 0, 0.0, 0.0
-    for landmarks, vertices in meshes:
-        distance = np.asarray(metrics.vertex_distance(decode(landmarks), vertices), np.float64)
-        count += len(distance)
-        total, squares = total + distance.sum(axis=0), squares + (distance**2).sum(axis=0)
-    if count == 0:
-        raise ValueError("expected meshes to measure on, got none")
-    found = {}
-    for name, mask in regions.items():
-        mean = float((total / count)[mask].mean())
-        square = float((squares / count)[mask].mean())
-        found[name] = {"mean_mm": mean, "std_mm": float(np.sqrt(max(square - mean**2, 0.0)))}
-    return found
 
 
 class Distances(NamedTuple):
@@ -69,12 +49,36 @@ def distances(
     `noise` is added to every landmark's coordinates, in mm: what a landmark detector would get wrong. `regions` are
     masks (N,).
     """
+
+    def made():
+        for subject in test.subjects:
+            neutral, landmarks, moved = test.person(subject)
+            if noise:
+                rng = np.random.default_rng([seed, int(subject)])
+                landmarks = landmarks + noise * rng.standard_normal(landmarks.shape)
+            # Filled up to a multiple, so that people with other numbers of frames compile nothing new.
+            filled = np.pad(landmarks.astype(np.float32), ((0, -len(landmarks) % 32), (0, 0), (0, 0)), mode="edge")
+            yield np.asarray(apply(filled, neutral))[: len(landmarks)] - neutral, moved
+
+    return _summed(made(), regions)
+
+
+def vertex_errors(
+    decode: Callable[[np.ndarray], jax.Array], meshes: Iterable[Batch], regions: dict[str, np.ndarray]
+) -> dict[str, dict[str, float]]:
+    """Mean and standard deviation of the vertex distance over vertices x frames, per region (a mask (N,)).
+
+    Of what knows no faces: `decode(landmark displacements (B, L, 3)) -> vertex displacements (B, N, 3)`.
+    """
+    found = _summed(((np.asarray(decode(landmarks)), vertices) for landmarks, vertices in meshes), regions)
+    return {name: dict(zip(("mean_mm", "std_mm"), found.mean_std(mask), strict=True)) for name, mask in regions.items()}
+
+
+def _summed(pairs: Iterable[Batch], regions: dict[str, np.ndarray]) -> Distances:
+    """Of pairs of made and true displacements (B, N, 3)."""
     found = None
-    for subject in test.subjects:
-        neutral, landmarks, moved = test.person(subject)
-        if noise:
-            landmarks = landmarks + noise * np.random.default_rng([seed, int(subject)]).standard_normal(landmarks.shape)
-        off = np.linalg.norm(apply(landmarks.astype(np.float32), neutral) - neutral - moved, axis=-1).astype(np.float64)
+    for made, true in pairs:
+        off = np.linalg.norm(made - true, axis=-1).astype(np.float64)
         bins = np.searchsorted(EDGES, off)
         counts = [np.bincount(bins[:, mask].ravel(), minlength=len(EDGES) + 1) for mask in regions.values()]
         mine = Distances(len(off), off.sum(axis=0), (off**2).sum(axis=0), np.stack(counts))

@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import evaluation, expand, fit_motion, fit_residual, pipeline
+from facejax import evaluation, expand, fit_gpmm, fit_motion, fit_residual, pipeline
 from facejax.data import makehuman, meshes, motions, store
 from facejax.io import dress
-from facejax.mesh import graph, topology
+from facejax.mesh import attachment, topology
 
-FACE_REACH = 25.0  # mm along the surface about a landmark: the face region
 FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
 
 
@@ -33,7 +32,6 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     check(data)
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
-    # The tables alone can take a minute, so that what the networks need is known before they begin.
     hierarchy = topology.build(mean, faces)
     chart = fit_motion.chart_of(
         motions.join(*fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.CHARTED)),
@@ -44,13 +42,13 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     )
     generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed)
     beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train"))
-    expander = fit_residual.fit(
-        meshes.of_split(data, "train"), hierarchy, folder / "meshes", plan=plans.residual, seed=seed
-    )
-    mask = graph.geodesic(mean, faces, at) <= FACE_REACH
+    train = meshes.of_split(data, "train")
+    # As many components as the file will hold: the network refines the very answer that it will meet.
+    base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
+    expander = fit_residual.fit(train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base)
     return pipeline.Models(
         labels=data.labels,
-        face=pipeline.Face(mean, faces, at, np.zeros(0, np.int32), mask),
+        face=pipeline.Face(mean, faces, at, np.zeros(0, np.int32), attachment.region(mean, faces, at)),
         props=props(),
         motion=generator,
         starts=beginnings,

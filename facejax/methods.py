@@ -72,7 +72,7 @@ class Rest(NamedTuple):
 def _hierarchy(train: Meshes, options: Options) -> topology.Hierarchy:
     if options.hierarchy is not None:
         return options.hierarchy
-    template = np.asarray(train.data.neutral, np.float64).mean(axis=0)
+    template = np.asarray(train.data.neutral[train.subjects], np.float64).mean(axis=0)
     return topology.build(template, np.asarray(train.data.faces))
 
 

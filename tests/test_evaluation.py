@@ -138,7 +138,8 @@ def test_the_truth_is_off_by_the_landmarks_noise_alone(ball_store):
 
     def met(landmarks, neutral):
         """The given landmarks where they are, and the truth elsewhere."""
-        moved = test.person(test.subjects[0])[2].copy()
+        true = test.person(test.subjects[0])[2]
+        moved = np.pad(true, ((0, len(landmarks) - len(true)), (0, 0), (0, 0)), mode="edge")
         moved[:, at] = landmarks
         return neutral + moved
 

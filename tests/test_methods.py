@@ -158,12 +158,12 @@ def test_what_will_be_new_is_said_to_every_choice(train, tmp_path, monkeypatch, 
     assert asked["s2d_residual"][1] == asked["gpmm"]
 
 
-def test_the_hierarchy_is_of_the_mean_face_unless_given(ball_store, tmp_path, monkeypatch):
+def test_the_hierarchy_is_of_the_training_peoples_mean_face_unless_given(ball_store, tmp_path, monkeypatch):
     built = []
     monkeypatch.setattr(topology, "build", lambda vertices, faces: built.append((vertices, faces)) or "hierarchy")
     monkeypatch.setattr(fit_neural3dmm, "fit", lambda train, hierarchy, folder, **options: hierarchy)
     train = of_split(ball_store, "train")
     assert methods.METHODS["neural3dmm"].fit(train, tmp_path, methods.Options()) == "hierarchy"
-    np.testing.assert_allclose(built[0][0], ball_store.neutral.mean(axis=0), atol=1e-4)
+    np.testing.assert_allclose(built[0][0], ball_store.neutral[ball_store.subjects("train")].mean(axis=0), atol=1e-4)
     assert methods.METHODS["neural3dmm"].fit(train, tmp_path, methods.Options(hierarchy="mine")) == "mine"
     assert len(built) == 1

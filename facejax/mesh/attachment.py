@@ -141,6 +141,11 @@ def weights(
     return found * falloff(vertices, faces, landmarks, reach=reach)[:, None]
 
 
+def region(vertices: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, within: float = 25.0) -> np.ndarray:
+    """The face of a head: a mask (N,) of the vertices `within` so many mm of a landmark's vertex, along the surface."""
+    return graph.geodesic(vertices, faces, landmark_index) <= within
+
+
 def _points(points: np.ndarray, name: str) -> np.ndarray:
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
