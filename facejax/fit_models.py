@@ -17,6 +17,7 @@ from facejax.data import makehuman, meshes, motions, store
 from facejax.io import dress
 from facejax.mesh import attachment, topology
 
+RANK = 128  # directions of motion, where there are enough motions to tell
 FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
 
 
@@ -33,10 +34,9 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = topology.build(mean, faces)
-    chart = fit_motion.chart_of(
-        motions.join(*fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.CHARTED)),
-        labels=len(data.labels),
-    )
+    known = motions.join(*fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.CHARTED))
+    # A quarter as many directions as there are motions: in directions that few of them take, the flow strays.
+    chart = fit_motion.chart_of(known, labels=len(data.labels), rank=min(RANK, len(known.start) // 4))
     examples = fit_motion.examples_of(
         chart, fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.SPREAD)
     )

@@ -48,6 +48,28 @@ def test_models_of_ones_own_generate_from_a_file(models, tiny_store, tmp_path):
     assert read.about["spec"]["level"] == 1 and read.about["data"] == "makehuman4d"
 
 
+def test_few_motions_make_a_small_chart(tiny_store, tmp_path, monkeypatch):
+    class Seen(Exception):
+        pass
+
+    def chart_of(known, *, labels, rank):
+        raise Seen(len(known.start), labels, rank)
+
+    monkeypatch.setattr(fit_motion, "chart_of", chart_of)
+    named = {label: tiny_store.labels.index(label) for label in ("neutral", "anger", "high_smile")}
+    few = tiny_store._replace(
+        index=tiny_store.index | {"labels": list(named)},
+        sequences=tuple(s for s in tiny_store.sequences if s.label in named),
+    )
+    with pytest.raises(Seen) as seen:
+        fit_models.fit(few, tmp_path)
+    motions, labels, rank = seen.value.args
+    assert labels == 3 and rank == motions // 4 < fit_models.RANK
+    with pytest.raises(Seen) as seen:
+        fit_models.fit(tiny_store, tmp_path)
+    assert seen.value.args[2] == fit_models.RANK
+
+
 def test_what_cannot_be_learnt_from_is_named(tiny_store):
     people = [person | {"split": "test" if i else "train"} for i, person in enumerate(tiny_store.index["subjects"])]
     with pytest.raises(ValueError, match="1 training subjects, expected 4 or more"):

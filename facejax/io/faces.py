@@ -16,7 +16,7 @@ from facejax.io import meshes
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
 SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
-HEAD_RANGE = (150.0, 400.0)  # mm, the longest side of a head, or of a face alone
+HEAD_RANGE = (100.0, 400.0)  # mm, the longest side of a head, or of a face alone, from chin to brow
 
 
 class Topology(NamedTuple):

@@ -63,3 +63,12 @@ def test_what_is_no_face_is_refused(topology, person):
         faces.fit(np.zeros_like(person), topology)
     with pytest.raises(meshes.MeshError, match=r"must be \(3260, 3\)"):
         faces.fit(person[:, :2], topology)
+
+
+@pytest.mark.parametrize(("size", "unit"), [(231.0, "millimetres"), (0.147, "metres"), (12.0, "centimetres")])
+def test_the_unit_of_a_mesh_without_known_landmarks_is_told_by_its_size(size, unit):
+    """Heads, and faces cut out of them: no size fits two units."""
+    millimetres, found = faces.unit_of_head(size, "it")
+    assert found == unit and millimetres == faces.UNITS[unit]
+    with pytest.raises(meshes.MeshError, match="it: 41 in size; expected a head of 100 to 400 mm"):
+        faces.unit_of_head(41.0, "it")
