@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,20 +103,33 @@ def judge(
     `trained` names the folder of checkpoints, where cases with the same training meshes share one.
     """
     kept = folder / name / case.name
-    folder = kept if trained is None else folder / name / trained
-    key = _key(name, case, options, noises)
-    known = _read(kept, key, noises)
-    if known is not None:
-        return known
-    method = methods.METHODS[name]
-    found = {}
+    return remembered(
+        kept,
+        key(name, case, options, noises),
+        noises,
+        lambda: _measured(name, case, kept if trained is None else folder / name / trained, options, regions, noises),
+    )
+
+
+def remembered(
+    folder: Path, key: str, noises: Sequence[float], measure: Callable[[], dict[float, Result]]
+) -> dict[float, Result]:
+    """What was measured before under this key, else measured now and kept in the folder."""
+    known = _read(folder, key, noises)
+    if known is None:
+        known = measure()
+        _write(folder, key, known)
+    return known
+
+
+def _measured(name, case, folder, options, regions, noises) -> dict[float, Result]:
     model, seconds = _fit(name, case, folder, options)
+    method, found = methods.METHODS[name], {}
     for noise in noises:
         distances = evaluation.distances(
             lambda marks, rest: method.apply(model, marks, rest), case.test, regions, noise=noise
         )
         found[noise] = Result(distances, round(seconds, 1), _about(name, model, options))
-    _write(kept, key, found)
     return found
 
 
@@ -140,11 +153,11 @@ _known_bases: dict[str, Any] = {}
 
 def base(case: Case, options: methods.Options):
     """The morphable model of a case, which two methods share: the last one is kept, so judge one after the other."""
-    key = _key("gpmm", case, options, ())
-    if key not in _known_bases:
+    facts = key("gpmm", case, options, ())
+    if facts not in _known_bases:
         _known_bases.clear()
-        _known_bases[key] = methods.METHODS["gpmm"].fit(case.train, Path(), options)
-    return _known_bases[key]
+        _known_bases[facts] = methods.METHODS["gpmm"].fit(case.train, Path(), options)
+    return _known_bases[facts]
 
 
 def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
@@ -157,7 +170,7 @@ def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 
-def _key(name: str, case: Case, options: methods.Options, noises: Sequence[float]) -> str:
+def key(name: str, case: Case, options: methods.Options, noises: Sequence[float]) -> str:
     """What a kept result depends on, as a hash."""
     plans = {
         "s2d": [options.decoder], "neural3dmm": [options.neural3dmm], "gpmm": [options.components],

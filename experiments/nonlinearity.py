@@ -15,6 +15,7 @@ goes on. `--levels`, `--noises` and `--methods` pick.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 from typing import Any
@@ -74,9 +75,15 @@ def run(config: Config) -> dict[str, Any]:
                     seconds += found[0.0].seconds
                     shown = ", ".join(f"{r.distances.mean_std(regions['head'])[0]:.4f}" for r in found.values())
                     print(f"{where} {name}: {shown} mm, {time.perf_counter() - begun:.0f} s", flush=True)
-                told, line = _told_and_floor(case, folder, options, regions)
+                told = _dense.remembered(
+                    folder / "told" / case.name,
+                    _dense.key("gpmm", case, options, LANDMARK_NOISE),
+                    LANDMARK_NOISE,
+                    functools.partial(_told_and_floor, case, options, regions),
+                )
+                floors.append(where | told[0.0].about)
+                told = {noise: result._replace(about={}) for noise, result in told.items()}
                 rows += _rows(where, "told", told, regions)
-                floors.append(where | line)
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"] | {"level": list(config.levels)})
     metrics = {"mode": mode, "rows": rows, "floor": floors}
     figure = _plot(config.out / "nonlinearity.png", rows, floors, config)
@@ -95,19 +102,19 @@ def _rows(where: dict[str, Any], name: str, found: dict, regions: dict[str, np.n
     return rows
 
 
-def _told_and_floor(case, folder: Path, options: methods.Options, regions: dict[str, np.ndarray]):
-    """The morphable model under each landmark noise that it is told, and the two floors."""
+def _told_and_floor(case, options: methods.Options, regions) -> dict[float, _dense.Result]:
+    """The morphable model under each landmark noise that it is told, with the two floors as what is known of it."""
     fitted = _dense.base(case, options)
-    told = {}
+    ridge = methods.METHODS["ridge"].fit(case.train, Path(), options).params
+    floors, told = _floors(case, fitted.params, ridge, regions), {}
     for noise in LANDMARK_NOISE:
         params = fitted.params._replace(prior=fitted.params.prior._replace(noise=fitted.params.prior.noise + noise**2))
         distances = evaluation.distances(
             lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.on_face(p, rest), marks)),
             case.test, regions, noise=noise,
         )  # fmt: skip
-        told[noise] = _dense.Result(distances, 0.0, {})
-    ridge = methods.METHODS["ridge"].fit(case.train, folder, options).params
-    return told, _floors(case, fitted.params, ridge, regions)
+        told[noise] = _dense.Result(distances, 0.0, floors)
+    return told
 
 
 def _floors(case, base: gpmm.Params, ridge: linear.Params, regions: dict[str, np.ndarray]) -> dict[str, Any]:
