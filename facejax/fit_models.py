@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import evaluation, expand, fit_gpmm, fit_motion, fit_residual, pipeline
+from facejax import evaluation, fit_gpmm, fit_motion, fit_residual, pipeline
 from facejax.data import makehuman, meshes, motions, store
 from facejax.io import dress
 from facejax.mesh import attachment, topology
@@ -73,14 +73,15 @@ def check(data: store.Store) -> None:
         )
 
 
-def judge(models: pipeline.Models, data: store.Store) -> dict[str, float]:
-    """Mean vertex error in mm on the people held out, by region; empty where nobody is."""
-    held = [split for split in ("validation", "test") if len(data.subjects(split))]
+def judge(models: pipeline.Models, data: store.Store, *splits: str) -> dict[str, float]:
+    """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
+    held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
     if not held:
         return {}
     regions = {"head": np.ones(len(models.face.vertices), bool), "face": np.asarray(models.face.mask)}
+    at = models.face.landmark_index
     found = evaluation.distances(
-        lambda marks, rest: rest + np.asarray(expand.apply(models.decoder, marks, rest)),
+        lambda marks, rest: np.asarray(pipeline.meshes(models, rest[at] + marks, rest)),
         meshes.of_split(data, *held), regions,
     )  # fmt: skip
     return {name: found.mean_std(mask)[0] for name, mask in regions.items()}
