@@ -126,16 +126,16 @@ def regions_of(data: store.Store) -> dict[str, np.ndarray]:
     if is_makehuman(data):
         mask = makehuman.template().face_mask
     else:
-        mask = attachment.region(_template(data), np.asarray(data.faces), np.asarray(data.landmark_index))
+        mask = attachment.region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
     return {"head": np.ones_like(mask), "face": mask}
 
 
 def hierarchy_of(data: store.Store) -> topology.Hierarchy:
     """The levels that spiral networks climb."""
-    return topology.build(_template(data), np.asarray(data.faces), cache=cache.folder())
+    return topology.build(template_of(data), np.asarray(data.faces), cache=cache.folder())
 
 
-def _template(data: store.Store) -> np.ndarray:
+def template_of(data: store.Store) -> np.ndarray:
     """The face on which tables are made: makehuman4d's own, else the mean of the training subjects."""
     if is_makehuman(data):
         return makehuman.template().vertices

@@ -3,26 +3,28 @@
 Two groups of people. Generators are chosen on "validation": the 20 validation subjects and 120 people of another
 population (seed 2). What is published is measured on "test": the 20 test subjects and 120 people of a third (seed 3).
 Their transitions are taken before any selection by prototypes, which narrows them: everybody's start meets
-everybody's end.
+everybody's end. On a dataset of the user's own the groups are its splits alone, and the pairs all of its labels'.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from sklearn.ensemble import RandomForestClassifier
 
-from facejax import augment, composition, fit_motion, metrics, pipeline
-from facejax.data import makehuman4d, motions, performance
+from experiments import _cases
+from facejax import augment, composition, metrics, pipeline
+from facejax.data import makehuman4d, motions, store
 from facejax.geometry import sphere
 from facejax.models import generators, starts
 
 GROUPS = {"validation": 2, "test": 3}  # a split of the dataset, and the seed of the population that joins it
+FEWEST = 4  # people, and motions of a pair
 Pair = tuple[int, int]
 Names = tuple[str, str]
 
@@ -43,6 +45,8 @@ class Held(NamedTuple):
 class People:
     """Options of an experiment on these groups."""
 
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d."""
     level: int = 3
     """Realism of the dataset."""
     subjects: int = 120
@@ -62,26 +66,48 @@ class Options(People):
     seed: int = 0
     """Of everything that is drawn."""
     models: tuple[Path, ...] = ()
-    """Weights to judge, the mean over them; by default the released ones."""
+    """Weights to judge, the mean over them; by default the released ones, which know makehuman4d alone."""
     samples: int = 64
     """Generated motions of each pair; of chains, each sequence."""
 
 
 def models_of(config: Options) -> list[pipeline.Models]:
-    """The models to judge. Loaded before anything else is done, so that a wrong name is told at once."""
-    return [pipeline.load(path) for path in config.models or (None,)]
+    """The models to judge, with the dataset's labels and landmarks. Raises `ValueError` for others."""
+    found, data = [pipeline.load(path) for path in config.models or (None,)], data_of(config)
+    for path, models in zip(config.models or ("the released models",), found, strict=True):
+        fits(models, data, path)
+    return found
 
 
-def data_of(config: People):
+def fits(models: pipeline.Models, data: store.Store, path: Path | str) -> None:
+    """Raise `ValueError` for models that were made for other labels or landmarks than the dataset's."""
+    known = models.labels, len(models.face.landmark_index)
+    wanted = data.labels, len(data.landmark_index)
+    if known != wanted:
+        raise ValueError(
+            f"{path}: expected the labels of {data.path}, {', '.join(data.labels)}, and its {wanted[1]} landmarks; got "
+            f"{', '.join(models.labels)}, and {known[1]}: `facejax fit --data` makes models of a dataset"
+        )
+
+
+def data_of(config: People) -> store.Store:
     """The dataset that generators are trained on."""
+    if config.data is not None:
+        return store.open_store(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+
+
+def names_of(data: store.Store) -> tuple[Names, ...]:
+    """The pairs that are judged: OT23's 39 on makehuman4d, else all that can be made of the labels."""
+    if _cases.is_makehuman(data):
+        return makehuman4d.PAIRS
+    return tuple(itertools.permutations(data.labels, 2))
 
 
 def halves_of(config: People, group: str) -> motions.Motions:
     """Every half of a group's people."""
-    data = data_of(config)
-    parts = [motions.halves(data, group)]
-    if config.people:
+    parts = [motions.halves(data_of(config), group)]
+    if config.people and config.data is None:
         spec = makehuman4d.Spec(config.level, config.people, config.people, seed=GROUPS[group])
         others = makehuman4d.prepare(spec)
         for split in ("train", "validation", "test"):
@@ -90,17 +116,25 @@ def halves_of(config: People, group: str) -> motions.Motions:
     return motions.join(*parts)
 
 
-def held(config: People, group: str, names: Sequence[Names] = makehuman4d.PAIRS) -> Held:
-    """Unselected transitions of a group's people: as many of each pair as there are people."""
-    labels = performance.LABELS
+def held(config: People, group: str, names: Sequence[Names]) -> Held:
+    """Unselected transitions of a group's people: as many of each pair as there are people.
+
+    Raises `ValueError` for fewer than four people: one half of them is compared with the other.
+    """
+    labels = data_of(config).labels
     halves = halves_of(config, group)
     pairs = [(labels.index(a), labels.index(b)) for a, b in names]
     people = len(np.unique(halves.subject))
+    if people < FEWEST:
+        raise ValueError(f"{config.data}: expected {FEWEST} or more people in the {group} split, got {people}")
     onsets = halves.take(halves.start == 0)
     between = motions.interpolated(onsets, len(labels), per_pair=people, choice="spread", only=set(pairs), seed=1)
     found = motions.join(halves, *between)
     scale = float(np.mean(found.scale))
     curves = [scale * of_pair(found, pair) for pair in pairs]
+    few = [" > ".join(name) for name, each in zip(names, curves, strict=True) if len(each) < FEWEST]
+    if few:
+        raise ValueError(f"{config.data}: expected {FEWEST} or more motions of every pair, not so of {', '.join(few)}")
     seconds = [found.seconds[(found.start == a) & (found.end == b)] for a, b in pairs]
     # Of the half that stands for "real", so that it is never compared with itself.
     halves = [np.zeros(len(c) // 2, int) for c in curves]
@@ -158,33 +192,6 @@ def _norm_error(generator, beginnings, keys, start, end):
         return sphere.norm(generators.sample(generator, key, start, end, starts.sample(beginnings, pose_key, start)).q)
 
     return jax.numpy.max(jax.numpy.abs(jax.vmap(norm)(keys) - 1))
-
-
-def forest(config: People, names: Sequence[Names], trees: int = 300) -> RandomForestClassifier:
-    """OT23's classifier: 30 x 204 displacements from neutral, unitless, of training people's transitions -> which pair.
-
-    Its training set is the one of OT23: halves, and transitions selected by prototypes.
-    """
-    data = data_of(config)
-    pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in names]
-    train, which = labelled(fit_motion.transitions(data, "train"), pairs)
-    found = RandomForestClassifier(trees, random_state=config.seed, n_jobs=-1)
-    return found.fit(train.curves.reshape(len(which), -1), which)
-
-
-def labelled(found: motions.Motions, pairs: Sequence[Pair]) -> tuple[motions.Motions, np.ndarray]:
-    """The motions of the given pairs, and which pair each is."""
-    number = {pair: i for i, pair in enumerate(pairs)}
-    which = np.array([number.get(pair, -1) for pair in zip(found.start.tolist(), found.end.tolist(), strict=True)])
-    return found.take(which >= 0), which[which >= 0]
-
-
-def recognised(classifier: RandomForestClassifier, curves: Sequence[np.ndarray], scale: float) -> list[float]:
-    """The share of each pair's curves (in mm) that are named rightly."""
-    shares = []
-    for i, found in enumerate(curves):
-        shares.append(float(np.mean(classifier.predict(found.reshape(len(found), -1) / scale) == i)))
-    return shares
 
 
 def scores(found: Sequence[np.ndarray], real: Held, train: Sequence[np.ndarray]) -> list[dict[str, float]]:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from experiments import _run
 from facejax import animation, expressions, files
-from facejax.data import makehuman
+from facejax.data import makehuman, store
 from facejax.io import dress, render
 
 matplotlib.use("Agg")
@@ -107,12 +107,20 @@ def plot(path: Path, judged: dict[str, dict]) -> Path:
     return path
 
 
-def sheet(path: Path, networks: expressions.Expressions) -> None:
-    """Each network's own expression on one unseen face, by radial basis functions; SL21, Fig. 5."""
-    shape, person = makehuman.template(), makehuman.subject(SHOWN)
-    template = shape.vertices[shape.landmarks]
-    face = animation.prepare(person.vertices, shape.faces, person.vertices[shape.landmarks], template)
-    teeth, rows = dress.Props(template, *makehuman.template_props()), []
+def sheet(path: Path, networks: expressions.Expressions, data: store.Store | None = None) -> None:
+    """Each network's own expression on one unseen face, by radial basis functions; SL21, Fig. 5.
+
+    A MakeHuman face, or the last one of a dataset.
+    """
+    shape = makehuman.template()
+    faces, index, rest = shape.faces, shape.landmarks, shape.vertices
+    if data is None:
+        shown = makehuman.subject(SHOWN).vertices
+    else:
+        faces, index, shown = (np.asarray(x) for x in (data.faces, data.landmark_index, data.neutral[-1]))
+        rest = np.asarray(data.neutral).mean(axis=0)
+    face = animation.prepare(shown, faces, shown[index], rest[index])
+    teeth, rows = dress.Props(shape.vertices[shape.landmarks], *makehuman.template_props()), []
     camera = render.aim(face.vertices, size=PICTURE, turn=15)
     for label in networks.labels:
         curve = np.asarray(expressions.displacements(networks, label, face.landmarks))

@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from experiments import _cases, _transferred
 from facejax.data import makehuman, performance, rig, store
 from facejax.geometry import rbf
 from facejax.io import dress, render
 from facejax.mesh import attachment, graph
 
 PEOPLE = (85, 102, 104, 111)  # of the validation and test subjects: 27 to 75 years old
-SEQUENCE = "surprise"  # of the picture after figure 4; the one after figure 6 shows the paper's, anger
+SEQUENCE, PAPERS = "surprise", "anger"  # of the picture after figure 4, and of the one after figure 6
 PICTURE = (170, 212)
 
 
@@ -42,6 +43,17 @@ class Face(NamedTuple):
     share: np.ndarray  # (N,) of the upper lip
     landmarks: np.ndarray  # (n, L, 3) displacements
     vertices: np.ndarray  # (n, N, 3) displacements
+
+
+def regions_of(data: store.Store) -> dict[str, np.ndarray]:
+    """Vertices of the head, of the face region, and on makehuman4d of the boundary's loops."""
+    found = {name: np.flatnonzero(mask) for name, mask in _cases.regions_of(data).items()}
+    if not _cases.is_makehuman(data):
+        return found
+    shape = makehuman.template()
+    loops = graph.boundary_loops(shape.faces)
+    neck, mouth, *eyes = sorted(loops, key=lambda loop: shape.vertices[loop, 1].mean())
+    return found | {"neck rim": neck, "mouth rim": mouth, "eye rims": np.concatenate(eyes)}
 
 
 def still(neutral: np.ndarray, faces: np.ndarray, marks: np.ndarray) -> Face:
@@ -79,47 +91,70 @@ def remeshed(face: Face, seed: int) -> Face:
 
 def sequence(data: store.Store, form: Form) -> np.ndarray:
     """After SL21's figure 4: landmarks over a mesh at rest, the meshes that they make of it, and the true ones."""
-    subject, spec = int(data.subjects("test")[0]), data.index["spec"]
-    person = makehuman.subject(subject, seed=spec["seed"])
-    face = _person(person)
-    take = performance.perform(SEQUENCE, subject, seed=spec["seed"])
-    onset = np.linspace(0, take.apex_start, 5).round()
-    shown = np.array([*onset, (take.apex_end + take.offset) // 2, take.offset], int)
-    true = rig.pose(rig.build(person, level=spec["level"]), take.weights[shown])[:, : len(face.neutral)]
-    moved = true[:, data.landmark_index] - face.marks
-    rest = np.broadcast_to(face.neutral, true.shape)
+    shown, take = _performed(data) if _cases.is_makehuman(data) else _recorded(data)
+    face, moved = _resting(data, take.rest), take.landmarks[take.at]
+    rest = np.broadcast_to(face.neutral, take.vertices.shape)
     warped = face.neutral + np.asarray(rbf.warp(weights(form, face), moved))
     rows = [
-        _pictures(face, vertices, moved, dots=dots) for vertices, dots in ((rest, True), (warped, True), (true, False))
+        _pictures(face, vertices, moved, dots=dots)
+        for vertices, dots in ((rest, True), (warped, True), (take.vertices, False))
     ]
     labels = [f"frame {t + 1}" for t in shown]
     return render.contact_sheet(rows, row_labels=["landmarks", "warped", "true"], column_labels=labels)
 
 
+def _performed(data: store.Store) -> tuple[np.ndarray, _transferred.Take]:
+    """Seven frames of the first test subject's surprise, on makehuman4d; its rig makes their meshes."""
+    subject, spec = int(data.subjects("test")[0]), data.index["spec"]
+    person = makehuman.subject(subject, seed=spec["seed"])
+    take = performance.perform(SEQUENCE, subject, seed=spec["seed"])
+    onset = np.linspace(0, take.apex_start, 5).round()
+    shown = np.array([*onset, (take.apex_end + take.offset) // 2, take.offset], int)
+    skin = rig.pose(rig.build(person, level=spec["level"]), take.weights[shown])[:, : len(person.vertices)]
+    return shown, _transferred.of_skin(skin, person, data.landmark_index)
+
+
+def _recorded(data: store.Store) -> tuple[np.ndarray, _transferred.Take]:
+    """Up to seven frames that have meshes, of a test subject's first recording."""
+    take = _transferred.of_sequence(data, _first(data))
+    some = np.unique(np.linspace(0, len(take.at) - 1, 7).round().astype(int))
+    return take.at[some], take._replace(at=take.at[some], vertices=take.vertices[some])
+
+
+def _first(data: store.Store) -> store.Sequence:
+    """The first test subject's anger, or another expression of which there are meshes."""
+    mine = [s for s in data.sequences if s.subject in data.subjects("test")[:1] and ">" not in s.label]
+    for sequence in sorted(mine, key=lambda s: s.label != PAPERS):
+        if len(_transferred.of_sequence(data, sequence).at):
+            return sequence
+    raise ValueError(f"{data.path}: expected recordings of a test subject with meshes")
+
+
 def others(data: store.Store, form: Form, odd: Face) -> np.ndarray:
-    """After SL21's figure 6: the anger of one test subject on five other faces, one of another connectivity."""
-    take = next(s for s in data.sequences if s.label == "anger" and s.subject == data.subjects("test")[0])
-    source = data.neutral[take.subject][data.landmark_index]
-    shown = np.array([*np.linspace(0, take.apex_start, 5).round(), (take.apex_end + take.offset) // 2], int)
-    motion = data.landmarks[take.start + shown] - source
-    people = [makehuman.subject(i, seed=data.index["spec"]["seed"]) for i in PEOPLE]
+    """After SL21's figure 6: the anger of one test subject on other faces, one of another connectivity."""
+    sequence = _first(data)
+    take = _transferred.of_sequence(data, sequence)
+    shown = np.array([*np.linspace(0, sequence.apex_start, 5).round(), (sequence.apex_end + sequence.offset) // 2], int)
+    source = take.rest[data.landmark_index]
+    people = PEOPLE if _cases.is_makehuman(data) else data.subjects("test")[-4:]
+    people = [i for i in people if i < len(data.neutral)]
     rows = []
-    for face in [*map(_person, people), odd]:
-        moved = motion * (_size(face.marks) / _size(source))
+    for face in [*(_resting(data, data.neutral[i]) for i in people), odd]:
+        moved = take.landmarks[shown] * (_size(face.marks) / _size(source))
         warped = face.neutral + np.asarray(rbf.warp(weights(form, face), moved))
         rows.append(_pictures(face, warped, moved, dots=False))
-    names = [person.name for person in people] + [f"{len(odd.neutral):,} vertices"]
+    names = [data.index["subjects"][i]["name"] for i in people] + [f"{len(odd.neutral):,} vertices"]
     return render.contact_sheet(rows, row_labels=names, column_labels=[f"frame {t + 1}" for t in shown])
 
 
-def heat(errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
+def heat(data: store.Store, errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
     """Errors (N,) by name on the average face, from the front and from the side; mm."""
-    shape, size = makehuman.template(), (240, 300)
+    mean, faces, size = _cases.template_of(data), np.asarray(data.faces), (240, 300)
     rows = [
         [
             render.image(
-                shape.vertices, shape.faces, size=size, colours=render.heat(values, high=high),
-                camera=render.aim(shape.vertices, size=size, turn=turn),
+                mean, faces, size=size, colours=render.heat(values, high=high),
+                camera=render.aim(mean, size=size, turn=turn),
             )
             for values in errors.values()
         ]
@@ -128,9 +163,9 @@ def heat(errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
     return render.contact_sheet(rows, column_labels=[f"{name}, 0 to {high:g} mm" for name in errors])
 
 
-def _person(person: makehuman.Subject) -> Face:
-    shape = makehuman.template()
-    return still(person.vertices, shape.faces, person.vertices[shape.landmarks])
+def _resting(data: store.Store, neutral: np.ndarray) -> Face:
+    neutral = np.asarray(neutral)
+    return still(neutral, np.asarray(data.faces), neutral[data.landmark_index])
 
 
 def _size(marks: np.ndarray) -> float:

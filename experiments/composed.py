@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from experiments import _judged, _run
+from experiments import _cases, _judged, _run
 from facejax import composition, files, io, metrics, pipeline
 from facejax.data import performance
 from facejax.io import dress, sheet
@@ -54,13 +55,15 @@ def run(config: Config) -> dict[str, Any]:
     """Compose, and measure along the way."""
     begun = time.perf_counter()
     judged = _judged.models_of(config)
-    chains = random_chains(config.chains, config.seed)
-    steps = {pair for labels in (*FIVE, *chains) for pair in zip(labels[:-1], labels[1:], strict=True)}
+    data = _judged.data_of(config)
+    chains = random_chains(config.chains, config.seed, data.labels)
+    five = FIVE if _cases.is_makehuman(data) else random_chains(5, config.seed + 1, data.labels, transitions=3)
+    steps = {pair for labels in (*five, *chains) for pair in zip(labels[:-1], labels[1:], strict=True)}
     real = _judged.held(config, "test", sorted(steps))
     of = {name: i for i, name in enumerate(real.names)}
     rows, errors = [], []
     for models in judged:
-        errors.append([_errors(models, config, labels, real, of) for labels in FIVE])
+        errors.append([_errors(models, config, labels, real, of) for labels in five])
         rows.append([_chain(models, config, i, labels, real, of) for i, labels in enumerate(chains)])
     davies = np.array([[row["davies_mm"] for row in each] for each in rows])  # models, chains, samples, transitions
     own = np.array([row["davies_real_mm"] for row in rows[0]])  # chains, transitions
@@ -77,12 +80,11 @@ def run(config: Config) -> dict[str, Any]:
         "davies_over_real_16_to_20": float(np.median(davies[..., 15:20] / own[:, None, 15:20])),
         "from_neutral_at_the_end_mm": float(np.max([[row["end_mm"] for row in each] for each in rows])),
         **joints,
-        "error_per_frame_mm": dict(zip(map(" > ".join, FIVE), np.mean(errors, axis=0).tolist(), strict=True)),
+        "error_per_frame_mm": dict(zip(map(" > ".join, five), np.mean(errors, axis=0).tolist(), strict=True)),
         "people": real.people,
     }  # fmt: skip
     figure = _plot(config.out, found)
     _picture(config.out, judged[0], chains[0], config.seed)
-    data = _judged.data_of(config)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("composed", config, found, made=made, table=_table(found), figure=figure)
     if config.publish:
@@ -91,17 +93,19 @@ def run(config: Config) -> dict[str, Any]:
     return found
 
 
-def random_chains(count: int, seed: int) -> list[tuple[str, ...]]:
-    """Chains of 21 labels, neutral first and last, in which none follows itself."""
+def random_chains(
+    count: int, seed: int, labels: Sequence[str] = performance.LABELS, *, transitions: int = TRANSITIONS
+) -> list[tuple[str, ...]]:
+    """Chains of so many transitions, neutral (the first label) first and last, in which no label follows itself."""
     random = np.random.default_rng(seed)
     chains = []
     for _ in range(count):
-        labels = ["neutral"]
-        while len(labels) < TRANSITIONS:
-            label = str(random.choice(performance.LABELS[1:]))
-            if label != labels[-1]:
-                labels.append(label)
-        chains.append((*labels, "neutral"))
+        chain = [labels[0]]
+        while len(chain) < transitions:
+            label = str(random.choice(labels[1:]))
+            if label != chain[-1]:
+                chain.append(label)
+        chains.append((*chain, labels[0]))
     return chains
 
 

@@ -21,7 +21,7 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from experiments import _run
+from experiments import _cases, _run
 from facejax import evaluation, files
 from facejax.data import makehuman, makehuman4d, performance, portrait, rig, store
 from facejax.data.meshes import of_split
@@ -41,6 +41,8 @@ class Config:
     """Folder for the results."""
     seed: int = makehuman4d.SEED
     """Of the dataset."""
+    data: Path | None = None
+    """A prepared dataset to describe in place of makehuman4d and its levels."""
     levels: tuple[int, ...] = rig.LEVELS
     """Levels of realism to describe."""
     subjects: int = 120
@@ -55,16 +57,21 @@ def run(config: Config) -> dict[str, Any]:
     """Describe every level."""
     begun = time.perf_counter()
     levels, histogram = {}, None
-    for level in config.levels:
-        spec = makehuman4d.Spec(level, config.subjects, config.meshes, config.seed)
-        data = makehuman4d.prepare(spec)
+    for level in config.levels if config.data is None else [config.data.name]:
+        if config.data is None:
+            data = makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes, config.seed))
+        else:
+            data = store.open_store(config.data)
         levels[str(level)] = _counts(data) | _linear_errors(data)
         histogram = _speeds(data)
     config.out.mkdir(parents=True, exist_ok=True)
     figure = _plot(config.out / "dataset_card.png", levels, histogram)
-    _sheet(config.out / "expressions.png", config)
-    _ladder(config.out / "levels.png", config)
-    if config.publish:
+    if config.data is None:
+        _sheet(config.out / "expressions.png", config)
+        _ladder(config.out / "levels.png", config)
+    else:
+        _farthest(config.out / "expressions.png", data)
+    if config.publish and config.data is None:
         for name in ("expressions", "levels"):
             with files.replacing(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
                 temporary.write_bytes((config.out / f"{name}.png").read_bytes())
@@ -78,7 +85,7 @@ def _counts(data: store.Store) -> dict[str, Any]:
     direct = sum(">" in s.label for s in data.sequences)
     at, owner = data.meshes("test")
     moved = np.linalg.norm(data.vertices[at] - data.neutral[owner], axis=-1)
-    mask = makehuman.template().face_mask
+    mask = _cases.regions_of(data)["face"]
     return {
         "subjects": {split: len(data.subjects(split)) for split in store.SPLITS},
         "sequences": len(data.sequences) - direct,
@@ -91,13 +98,12 @@ def _counts(data: store.Store) -> dict[str, Any]:
 
 
 def _linear_errors(data: store.Store) -> dict[str, Any]:
-    """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on three of CoMA's at a time unseen."""
-    mask = makehuman.template().face_mask
-    regions = {"head": np.ones_like(mask), "face": mask}
+    """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on a fourth of them that is unseen."""
+    regions = _cases.regions_of(data)
     train, test = of_split(data, "train"), of_split(data, "test")
     splits = {"subjects": [(train, test)], "expressions": []}
-    for i in range(0, 12, 3):
-        held = performance.COMA[i : i + 3]
+    names = performance.COMA if _cases.is_makehuman(data) else sorted(set(test.labels))
+    for held in np.array_split(names, min(_cases.FOLDS, len(names))):
         splits["expressions"].append((train.of_labels(held, without=True), test.of_labels(held)))
     found: dict[str, Any] = {}
     for split, folds in splits.items():
@@ -156,6 +162,23 @@ def _sheet(path: Path, config: Config) -> None:
         for part in (slice(0, half), slice(half, None))
     ]
     _save(path, np.concatenate(sheets))
+
+
+def _farthest(path: Path, data: store.Store) -> None:
+    """Of up to five people and nine labels of a dataset, the mesh that is farthest from neutral."""
+    labels, at, faces = data.row_labels()[data.drawn], data.row_subjects()[data.drawn], np.asarray(data.faces)
+    names, people = sorted(set(labels))[:9], np.unique(at)[:5]
+    rows = []
+    for person in people:
+        rest, row = np.asarray(data.neutral[person]), []
+        for name in names:
+            mine = np.flatnonzero((at == person) & (labels == name))
+            moved = np.linalg.norm(data.vertices[mine] - rest, axis=-1).mean(axis=-1)
+            shown = data.vertices[mine[moved.argmax()]] if len(mine) else rest
+            row.append(render.image(shown, faces, size=PICTURE, camera=render.aim(rest * 1.08, size=PICTURE, turn=18)))
+        rows.append(row)
+    known = [data.index["subjects"][person]["name"] for person in people]
+    _save(path, render.contact_sheet(rows, row_labels=known, column_labels=names))
 
 
 def _ladder(path: Path, config: Config) -> None:

@@ -8,8 +8,9 @@ join either, since 20 people have too few ways of doing things to tell one varia
 
     python -m experiments.expression_lstm --publish
 
-Every variant keeps its run in a folder and goes on from there when it was stopped; `--release` puts the chosen one's
-weights into the package. Two hours on 2 cores for all variants; `--variants` names some.
+With `--data STORE` all of a dataset's expressions, and its own people alone. Every variant keeps its run in a folder
+and goes on from there when it was stopped; `--release` puts the chosen one's weights into the package. Two hours on 2
+cores for all variants; `--variants` names some.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import _run, _scored
+from experiments import _cases, _run, _scored
 from facejax import evaluation, expressions, files, fit_expressions, journal
 from facejax.data import makehuman4d, performance, sequences, store
 from facejax.fit_expressions import PAPER, ExpressionPlan
@@ -80,8 +81,10 @@ class Config:
     """Which ways of training; the best of them on validation subjects is judged on test subjects."""
     steps: int | None = None
     """Training steps in place of each variant's own."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d."""
     level: int = 3
-    """Realism of the dataset."""
+    """Realism of makehuman4d."""
     subjects: int = 120
     """Of the dataset."""
     meshes: int = 20_000
@@ -105,10 +108,13 @@ def run(config: Config) -> dict[str, Any]:
     metrics = {"chosen": name, "choice": table, "test": judged, "test_alone": alone, "train_seconds": seconds}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=_dataset(config, variant).index["spec"])
     networks = networks._replace(about={"made": made, "variant": name, "plan": variant.plan._asdict(), "test": judged})
+    if config.release and config.data is not None:
+        raise ValueError("--release puts networks of makehuman4d into the package: leave out --data")
     for path in [config.out / expressions.RELEASED] + [PACKAGED] * config.release:
         expressions.save(path, networks)
     figure = _scored.plot(config.out / "expression_lstm.png", judged)
-    _scored.sheet(config.out / "sheet.png", expressions.load(config.out / expressions.RELEASED))
+    shown = expressions.load(config.out / expressions.RELEASED)
+    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else store.open_store(config.data))
     if config.publish:
         with files.replacing(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
@@ -142,7 +148,7 @@ def train(config: Config, name: str) -> sequence.Params:
     return fit_expressions.fit(
         sequences.join(learnt_from, sequences.mirrored(learnt_from)) if variant.mirror else learnt_from,
         folder(config, name),
-        labels={label: data.labels.index(label) for label in performance.EMOTIONS},
+        labels={label: data.labels.index(label) for label in labels_of(data)},
         plan=plan,
         config=variant.config,
         masked=variant.masked,
@@ -151,14 +157,20 @@ def train(config: Config, name: str) -> sequence.Params:
 
 
 def recordings(config: Config, variant: Variant, split: str) -> sequences.Sequences:
-    """The six emotions of a split's subjects, or of a population in `MORE`; heads move as the variant wants them."""
+    """The emotions of a split's subjects, or of a population in `MORE`; heads move as the variant wants them."""
     if split in MORE:
         spec = _spec(config, variant)._replace(meshes=min(config.meshes, config.subjects), seed=MORE[split])
         people = makehuman4d.prepare(spec)
         found = sequences.join(*(sequences.read(people, part, performance.EMOTIONS) for part in store.SPLITS))
     else:
-        found = sequences.read(_dataset(config, variant), split, performance.EMOTIONS)
+        data = _dataset(config, variant)
+        found = sequences.read(data, split, labels_of(data))
     return sequences.without_head_motion(found) if variant.head == "removed" else found
+
+
+def labels_of(data: store.Store) -> tuple[str, ...]:
+    """What there is a network for: the six emotions, or all expressions of a dataset of the user's own."""
+    return performance.EMOTIONS if _cases.is_makehuman(data) else data.labels[1:]
 
 
 def folder(config: Config, name: str) -> Path:
@@ -171,17 +183,19 @@ def _spec(config: Config, variant: Variant) -> makehuman4d.Spec:
 
 
 def _dataset(config: Config, variant: Variant) -> store.Store:
+    if config.data is not None:
+        return store.open_store(config.data)
     return makehuman4d.prepare(_spec(config, variant))
 
 
 def scores(config: Config, variant: Variant, params: sequence.Params, splits: tuple[str, ...]) -> dict[str, dict]:
     """`evaluation.expression_scores` of each emotion; all `splits` together, the first where heads move."""
     data = _dataset(config, variant)
-    splits = splits if variant.head == "none" else splits[:1]
+    splits = splits if variant.head == "none" and config.data is None else splits[:1]
     train = recordings(config, variant, "train")
     held_out = sequences.join(*(recordings(config, variant, split) for split in splits))
     found = {}
-    for i, label in enumerate(performance.EMOTIONS):
+    for i, label in enumerate(labels_of(data)):
         number = data.labels.index(label)
         parts = (held_out.take(held_out.label == number), train.take(train.label == number))
         network, start = fit_expressions.network(params, i), variant.config.start
@@ -190,8 +204,8 @@ def scores(config: Config, variant: Variant, params: sequence.Params, splits: tu
 
 
 def _networks(config: Config, variant: Variant, params: sequence.Params) -> expressions.Expressions:
-    frames = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL
-    return expressions.Expressions(performance.EMOTIONS, params, variant.config, 30.0, frames, {})
+    frames, data = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL, _dataset(config, variant)
+    return expressions.Expressions(labels_of(data), params, variant.config, float(data.index["rate"]), frames, {})
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
     python -m experiments.figure9 --publish
     python -m experiments.figure9 --recording take.csv
+    python -m experiments.figure9 --data STORE --model MODEL
 
 Above, two chains of transitions on unseen people. Below, the motion of one unseen person on two others: of a
 recording of Live Link Face where one is given, else a performance of makehuman4d; its landmarks go through their SRVF
-to the other face's neutral landmarks, and from there to its mesh. The films lie beside the picture.
+to the other face's neutral landmarks, and from there to its mesh. With `--data`, three people of a dataset, chains of
+its labels, and the first label that all three have recordings of. The films lie beside the picture.
 """
 
 from __future__ import annotations
@@ -19,15 +21,16 @@ import jax
 import numpy as np
 from PIL import Image
 
-from experiments import _run, _transferred
+from experiments import _judged, _run, _transferred
 from facejax import drive, files, io, pipeline, results
-from facejax.data import makehuman, makehuman4d, performance, rig
+from facejax.data import makehuman, makehuman4d, performance, rig, store
 from facejax.io import dress, render
 
 CHAINS = (
     ("neutral", "mouth_down", "mouth_side", "mouth_open", "lips_back", "neutral"),
     ("neutral", "eyebrow", "high_smile", "mouth_extreme", "bareteeth", "neutral"),
 )
+PEOPLE = (103, 108, 114)
 PERFORMED = ("happiness", "mouth_extreme")  # one after the other, where no recording is given
 SHOWN = 10
 PICTURE = (150, 188)
@@ -41,8 +44,11 @@ class Config:
     """Of the generated motion."""
     model: Path | None = None
     """Weights to use in place of the released ones."""
-    people: tuple[int, ...] = (103, 108, 114)
-    """MakeHuman people (100 to 119 are test subjects): the chains' two, who are also the targets, and the source."""
+    data: Path | None = None
+    """A prepared dataset, of which `--model` was made, in place of MakeHuman's people."""
+    people: tuple[int, ...] = ()
+    """Numbers of the chains' two people, who are also the targets, and the source; by default 103, 108 and 114, of
+    MakeHuman's test subjects (100 to 119), or three whom the dataset holds out."""
     recording: Path | None = None
     """A recording of Live Link Face (CSV)."""
     begin: float = 60.0
@@ -54,61 +60,87 @@ class Config:
 
 
 def run(config: Config) -> dict[str, Any]:
-    """The sheet, the films, and how far the transferred motion is from what the target's own rig does."""
-    if len(config.people) != 3:
-        raise ValueError(f"--people: expected three numbers, got {config.people}")
+    """The sheet, the films, and how far the transferred motion is from how the target itself moves."""
     begun, models = time.perf_counter(), pipeline.load(config.model)
-    people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in config.people]
-    rows, labels, films = [], [], {}
-    for i, (chain, person) in enumerate(zip(CHAINS, people, strict=False)):
+    index = np.asarray(models.face.landmark_index)
+    chains, takes = _stored(config, models) if config.data else (CHAINS, _performed(config, index))
+    labels, films = [], {}
+    for i, (chain, take) in enumerate(zip(chains, takes, strict=False)):
         key = jax.random.fold_in(jax.random.key(config.seed), i)
-        marks = np.asarray(pipeline.landmarks(models, key, chain, person.vertices))
-        films[f"chain{i + 1}"] = person, np.asarray(pipeline.meshes(models, marks, person.vertices)), marks
+        marks = np.asarray(pipeline.landmarks(models, key, chain, take.rest))
+        films[f"chain{i + 1}"] = take, np.asarray(pipeline.meshes(models, marks, take.rest)), marks
         labels.append(", ".join(chain[1:-1]))
-    source = people[2]
-    moved = _source(config, source)
-    films["source"] = source, moved, moved[:, models.face.landmark_index]
+    *targets, source = takes
+    films["source"] = source, source.vertices, source.vertices[:, index]
     labels.append("source")
-    errors = []
-    for i, person in enumerate(people[:2]):
-        displaced = _transferred.transfer(moved, source.vertices, person.vertices, models.face.landmark_index)
-        marks = person.vertices[models.face.landmark_index] + displaced
-        vertices = np.asarray(pipeline.meshes(models, marks.astype(np.float32), person.vertices))
-        films[f"transfer{i + 1}"] = person, vertices, marks
-        labels.append(f"on {person.name}")
-        true = _source(config, person)
-        errors.append({"target": person.name, "mean_mm": float(np.linalg.norm(vertices - true, axis=-1).mean()),
-                       "still_mm": float(np.linalg.norm(person.vertices - true, axis=-1).mean())})  # fmt: skip
+    errors, everywhere = [], np.ones(len(source.rest), bool)
+    for i, take in enumerate(targets):
+        marks = (take.rest[index] + _transferred.onto(source, take, index)).astype(np.float32)
+        vertices = np.asarray(pipeline.meshes(models, marks, take.rest))
+        films[f"transfer{i + 1}"] = take, vertices, marks
+        labels.append(f"on {take.name}")
+        still = np.broadcast_to(take.rest, vertices.shape)
+        mean, at_rest = (float(_transferred.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still))
+        errors.append({"target": take.name, "mean_mm": mean, "still_mm": at_rest})
     results.writable(config.out)
-    for name, (person, vertices, marks) in films.items():
-        extras = dress.parts(models.props, person.vertices[models.face.landmark_index], marks)
+    rows = []
+    for name, (take, vertices, marks) in films.items():
+        extras = dress.parts(models.props, take.rest[index], marks)
         io.save(config.out / f"{name}.glb", vertices, models.face.faces, extras=extras)
-        rows.append(_pictures(models, person, vertices, extras))
+        rows.append(_pictures(models, take.rest, vertices, extras))
     path = config.out / "figure9.png"
     with files.replacing(path) as temporary:
         Image.fromarray(render.contact_sheet(rows, row_labels=labels)).save(temporary)
-    made = _run.record(config, seconds=time.perf_counter() - begun, dataset=models.about["made"]["dataset"])
-    metrics = {"chains": CHAINS, "transfer": errors, "recording": config.recording and config.recording.name}
+    made = _run.record(config, seconds=time.perf_counter() - begun, dataset=_dataset(models))
+    metrics = {"chains": chains, "transfer": errors, "recording": config.recording and config.recording.name}
     body = [(e["target"], f"{e['mean_mm']:.3f}", f"{e['still_mm']:.3f}") for e in errors]
-    table = _run.markdown(("motion of another person on", "off its own rig's motion, mm", "left still"), body)
+    table = _run.markdown(("motion of another person on", "off its own motion, mm", "left still"), body)
     _run.finish("figure9", config, metrics, made=made, table=table, figure=path)
     return metrics
 
 
-def _source(config: Config, person: makehuman.Subject) -> np.ndarray:
-    """A person's skin (T, N, 3) under the recording, or as the source performs."""
+def _performed(config: Config, index: np.ndarray) -> list[_transferred.Take]:
+    """Three of MakeHuman's people under the recording, or as the third of them performs."""
+    numbers = config.people or PEOPLE
+    if len(numbers) != 3:
+        raise ValueError(f"--people: expected three numbers, got {config.people}")
+    people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]
     if config.recording is not None:
         take = drive.read_recording(config.recording, begin=config.begin, seconds=config.seconds)
-        return drive.posed(take, person)[:, : len(person.vertices)]
-    takes = [performance.perform(label, config.people[2], seed=makehuman4d.SEED).weights for label in PERFORMED]
-    weights = np.concatenate(takes)
-    return rig.pose(rig.build(person, level=drive.LEVEL), weights)[:, : len(person.vertices)]
+        return [_transferred.posed(take, person, index) for person in people]
+    takes = [performance.perform(label, numbers[2], seed=makehuman4d.SEED).weights for label in PERFORMED]
+    weights, found = np.concatenate(takes), []
+    for person in people:
+        skin = rig.pose(rig.build(person, level=drive.LEVEL), weights)[:, : len(person.vertices)]
+        found.append(_transferred.of_skin(skin, person, index))
+    return found
 
 
-def _pictures(models, person, vertices, extras) -> np.ndarray:
+def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_transferred.Take]]:
+    """Two chains of a dataset's labels, and one label's recordings of three people."""
+    data = store.open_store(config.data)
+    _judged.fits(models, data, config.model or "the released models")
+    held = np.concatenate([data.subjects(split) for split in ("test", "validation", "train")])
+    numbers = list(config.people or held[:3].tolist())
+    if len(numbers) != 3 or not set(numbers) <= set(held.tolist()):
+        raise ValueError(f"--people: expected three of {data.path}'s {len(held)} people, got {numbers}")
+    for label in data.labels[1:]:
+        takes = [_transferred.stored(data, number, label) for number in numbers]
+        if None not in takes:
+            rng = np.random.default_rng(config.seed)
+            names = [rng.permutation(data.labels[1:])[:4].tolist() for _ in CHAINS]
+            return [(data.labels[0], *chain, data.labels[0]) for chain in names], takes
+    raise ValueError(f"{data.path}: has no label under which the people {numbers} all have recordings with meshes")
+
+
+def _dataset(models: pipeline.Models) -> dict[str, Any]:
+    return models.about["made"]["dataset"] if "made" in models.about else models.about["spec"]
+
+
+def _pictures(models, rest, vertices, extras) -> np.ndarray:
     shown = np.linspace(0, len(vertices) - 1, SHOWN).round().astype(int)
     parts = [part._replace(vertices=part.vertices[shown]) if part.vertices.ndim == 3 else part for part in extras]
-    camera = render.aim(person.vertices * 1.08, size=PICTURE, turn=18)
+    camera = render.aim(rest * 1.08, size=PICTURE, turn=18)
     return render.frames(vertices[shown], models.face.faces, size=PICTURE, camera=camera, extras=parts)
 
 

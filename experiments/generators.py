@@ -23,9 +23,9 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _judged, _run
-from facejax import fit_motion, journal, pipeline
-from facejax.data import makehuman4d, motions
+from experiments import _judged, _recognised, _run
+from facejax import fit_models, fit_motion, journal, pipeline
+from facejax.data import motions
 from facejax.models import flow, motion_reference
 
 matplotlib.use("Agg")
@@ -63,6 +63,8 @@ class Config(_judged.People):
     """Of the authors' GAN, of which a sample costs as much as a batch of the others."""
     reference_batch: int = 16
     """Its samples in a step."""
+    model: Path | None = None
+    """Weights that lend the files of the generators their way to meshes; by default the released ones."""
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -72,6 +74,8 @@ def run(config: Config) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"--variants: unknown {_quoted(unknown)}; there are {_quoted(VARIANTS)}")
     data = _judged.data_of(config)
+    lent = pipeline.load(config.model)
+    _judged.fits(lent, data, config.model or "the released models")
     examples = functools.cache(lambda source: _examples(data, source))
     judge = functools.cache(lambda: _judge(config))
     for name in config.variants:
@@ -79,7 +83,7 @@ def run(config: Config) -> dict[str, Any]:
             path = weights_of(config.out, name, seed)
             score_path = path.with_suffix(".json")
             if not path.exists():
-                _train(config, name, seed, data, examples, path)
+                _train(config, name, seed, data, examples, lent, path)
                 score_path.unlink(missing_ok=True)
             if not score_path.exists():
                 models = pipeline.load(path)
@@ -98,7 +102,9 @@ def run(config: Config) -> dict[str, Any]:
     }
     figure = _plot(config.out, table, real)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
-    _run.finish("generators", config, metrics, made=made, table=_table(table, real), figure=figure)
+    _run.finish(
+        "generators", config, metrics, made=made, table=_table(table, real, len(_judged.names_of(data))), figure=figure
+    )
     return metrics
 
 
@@ -135,21 +141,21 @@ def _examples(data, source: str) -> tuple[motions.Motions, Any, fit_motion.Examp
     labels = len(data.labels)
     if source == "prototypes":
         known = fit_motion.transitions(data, "train")
-        chart = fit_motion.chart_of(known, labels=labels)
+        chart = fit_motion.chart_of(known, labels=labels, rank=fit_models.rank_of(known))
         return known, chart, fit_motion.examples_of(chart, [known])
     known = motions.join(*fit_motion.everything(data, "train", per_pair=fit_motion.CHARTED))
-    chart = fit_motion.chart_of(known, labels=labels)
+    chart = fit_motion.chart_of(known, labels=labels, rank=fit_models.rank_of(known))
     return known, chart, fit_motion.examples_of(chart, fit_motion.everything(data, "train"))
 
 
-def _train(config: Config, name: str, seed: int, data, examples, path: Path) -> None:
+def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.Models, path: Path) -> None:
     """Train one variant and write its weights."""
     source, kind, options = VARIANTS[name]
     known, chart, found = examples(source)
     # A variant that differs in what is made of a run shares the run.
     folder = weights_of(config.out, name.removesuffix(", last weights"), seed).with_suffix("")
     if kind == "gaussian":
-        generator = flow.init(jax.random.key(seed), chart)
+        generator = flow.init(jax.random.key(seed), chart, config=fit_motion.sized(flow.Config(), chart))
     elif kind == "flow":
         plan = fit_motion.FlowPlan(steps=config.flow_steps)
         generator = fit_motion.fit_flow(found, chart, folder, plan=plan, seed=seed)
@@ -163,7 +169,7 @@ def _train(config: Config, name: str, seed: int, data, examples, path: Path) -> 
         eighth = motion_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
     beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train"))
-    models = pipeline.load()._replace(motion=generator, starts=beginnings)
+    models = lent._replace(motion=generator, starts=beginnings)
     # Of the steps alone, over all runs that it took: compiling and preparing are the same for all.
     seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in journal.read(folder))
     about = {"variant": name, "seed": seed, "seconds": seconds}
@@ -172,10 +178,10 @@ def _train(config: Config, name: str, seed: int, data, examples, path: Path) -> 
 
 def _judge(config: Config):
     """A function from models, or None for real people, to the mean figures on validation people."""
-    names = makehuman4d.PAIRS
+    names = _judged.names_of(_judged.data_of(config))
     real = _judged.held(config, "validation", names)
     train = _judged.seen(config, real.pairs, real.scale, 3 * fit_motion.CHARTED)
-    forest = _judged.forest(config, names)
+    forest = _recognised.forest(config, names)
 
     def judge(models: pipeline.Models | None) -> dict[str, Any]:
         found = _judged.ceiling(real)
@@ -183,7 +189,7 @@ def _judge(config: Config):
             count = max(len(curves) for curves in found)
             found = _judged.drawn(models, real, samples=count, seed=config.seed)
         means = _judged.mean_of(_judged.scores(found, real, train))
-        return means | {"accuracy": float(np.mean(_judged.recognised(forest, found, real.scale)))}
+        return means | {"accuracy": float(np.mean(_recognised.recognised(forest, found, real.scale)))}
 
     return judge
 
@@ -201,7 +207,7 @@ def _over_seeds(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return means | {"seeds": len(rows), "energy_range": [min(energies), max(energies)]}
 
 
-def _table(table: dict[str, dict[str, Any]], real: dict[str, Any]) -> str:
+def _table(table: dict[str, dict[str, Any]], real: dict[str, Any], pairs: int) -> str:
     def row(name, r):
         return (
             name,
@@ -218,8 +224,8 @@ def _table(table: dict[str, dict[str, Any]], real: dict[str, Any]) -> str:
         )
 
     header = (
-        "validation people, 39 pairs", "energy distance", "coverage", "specificity / real", "nearest trained on / real",
-        "diversity", "acceleration", "accuracy", "minutes", "seeds",
+        f"validation people, {pairs} pairs", "energy distance", "coverage", "specificity / real",
+        "nearest trained on / real", "diversity", "acceleration", "accuracy", "minutes", "seeds",
     )  # fmt: skip
     return _run.markdown(header, [*(row(name, r) for name, r in table.items()), row("other real people", real)])
 

@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 from sklearn.ensemble import RandomForestClassifier
 
+from experiments import _cases, _recognised, _run
 from experiments import _interpolated as made_of
 from experiments import _interpolated_drawn as drawn
-from experiments import _judged, _run
 from experiments._interpolated import PACES, PATHS, WAYS
 from facejax import augment, files, fit_motion
 from facejax.data import makehuman4d, motions, store
@@ -44,6 +44,8 @@ class Config:
     """Folder for the results."""
     seed: int = 0
     """Of the pairs of people, and of the forests."""
+    data: Path | None = None
+    """A makehuman4d of your own making, with noise or heads that move, in place of the default one."""
     level: int = 3
     """Realism of the dataset."""
     subjects: int = 120
@@ -65,7 +67,7 @@ class Config:
 def run(config: Config) -> dict[str, Any]:
     """Measure the three, and draw."""
     begun = time.perf_counter()
-    data = makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+    data = _data(config)
     onsets = made_of.onsets_of(made_of.joined(data, HELD_OUT))
     direct = made_of.joined(data, HELD_OUT, motions.directs)
     walks = _walks(onsets, direct)
@@ -85,6 +87,15 @@ def run(config: Config) -> dict[str, Any]:
         with files.replacing(_run.RESULTS / "interpolation_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
     return metrics
+
+
+def _data(config: Config) -> store.Store:
+    if config.data is None:
+        return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+    data = store.open_store(config.data)
+    if not _cases.is_makehuman(data):
+        raise ValueError(f"{data.path}: only makehuman4d has transitions that were performed from peak to peak")
+    return data
 
 
 def _onsets(config: Config, data: store.Store, onsets: motions.Motions) -> dict[str, Any]:
@@ -152,13 +163,13 @@ def _recognition(config: Config, data: store.Store, direct: motions.Motions) -> 
     halves = motions.halves(data, "train")
     onsets = made_of.onsets_of(halves)
     first, second = _selected(onsets, set(pairs), len(data.labels)).T
-    judged, which = _judged.labelled(direct, pairs)
+    judged, which = _recognised.labelled(direct, pairs)
     found = {}
     for path, pace in WAYS:
         curves = made_of.walk(onsets.curves[first], onsets.curves[second], path=path, pace=pace).curves
         labels = onsets.end[first], onsets.end[second]
         between = motions.Motions(curves, *labels, *(field[first] for field in onsets[3:]))
-        train, target = _judged.labelled(motions.join(halves, between), pairs)
+        train, target = _recognised.labelled(motions.join(halves, between), pairs)
         forest = RandomForestClassifier(config.trees, random_state=config.seed, n_jobs=-1)
         forest.fit(train.curves.reshape(len(target), -1), target)
         named = forest.predict(judged.curves.reshape(len(which), -1))

@@ -9,13 +9,14 @@ model that knows how noisy the landmarks are. The floor is what the landmarks le
 whoever sees landmarks alone, and for whoever sees the person's face as well.
 
 `--quick` is a look; `--paper` trains for 300 epochs. Hours on 2 cores, most of them for the networks; a stopped run
-goes on. `--levels`, `--noises` and `--methods` pick.
+goes on. `--levels`, `--noises` and `--methods` pick; `--data` takes a dataset of the user's own in place of all rungs.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import time
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ COLOURS = {"ridge": "#c46b4e", "pca220": "#5b8db8", "rbf": "#999999", "gpmm": "#
 class Config(_dense.Options):
     out: Path = Path("runs/nonlinearity")
     """Folder for checkpoints and results."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d and its levels."""
     levels: tuple[int, ...] = rig.LEVELS
     """Levels of realism."""
     noises: tuple[float, ...] = (0.0, 0.3)
@@ -58,32 +61,33 @@ def run(config: Config) -> dict[str, Any]:
     mode = config.mode
     _dense.check_methods(config.methods)
     rows, floors, seconds = [], [], 0.0
-    for noise in config.noises:
-        for level in config.levels:
-            data = _cases.data_of(None, mode, level=level, noise=noise)
-            regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
-            for split in config.splits:
-                case = _cases.cases(data, [split])[0]
-                where = {"level": level, "noise_mm": noise, "split": split}
-                plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
-                options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
-                folder = config.folder() / f"level{level}-noise{noise:g}"
-                for name in config.methods:
-                    begun = time.perf_counter()
-                    found = _dense.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)
-                    rows += _rows(where, name, found, regions)
-                    seconds += found[0.0].seconds
-                    shown = ", ".join(f"{r.distances.mean_std(regions['head'])[0]:.4f}" for r in found.values())
-                    print(f"{where} {name}: {shown} mm, {time.perf_counter() - begun:.0f} s", flush=True)
-                told = _dense.remembered(
-                    folder / "told" / case.name,
-                    _dense.key("gpmm", case, options, LANDMARK_NOISE),
-                    LANDMARK_NOISE,
-                    functools.partial(_told_and_floor, case, options, regions),
-                )
-                floors.append(where | told[0.0].about)
-                told = {noise: result._replace(about={}) for noise, result in told.items()}
-                rows += _rows(where, "told", told, regions)
+    if config.data is not None:
+        config = dataclasses.replace(config, levels=(config.data.name,), noises=(0.0,))
+    for noise, level in itertools.product(config.noises, config.levels):
+        data = _cases.data_of(config.data, mode, level=level, noise=noise)
+        regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+        for split in config.splits:
+            case = _cases.cases(data, [split])[0]
+            where = {"level": level, "noise_mm": noise, "split": split}
+            plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
+            options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
+            folder = config.folder() / f"level{level}-noise{noise:g}"
+            for name in config.methods:
+                begun = time.perf_counter()
+                found = _dense.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)
+                rows += _rows(where, name, found, regions)
+                seconds += found[0.0].seconds
+                shown = ", ".join(f"{r.distances.mean_std(regions['head'])[0]:.4f}" for r in found.values())
+                print(f"{where} {name}: {shown} mm, {time.perf_counter() - begun:.0f} s", flush=True)
+            told = _dense.remembered(
+                folder / "told" / case.name,
+                _dense.key("gpmm", case, options, LANDMARK_NOISE),
+                LANDMARK_NOISE,
+                functools.partial(_told_and_floor, case, options, regions),
+            )
+            floors.append(where | told[0.0].about)
+            told = {noise: result._replace(about={}) for noise, result in told.items()}
+            rows += _rows(where, "told", told, regions)
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"] | {"level": list(config.levels)})
     metrics = {"mode": mode, "rows": rows, "floor": floors}
     figure = _plot(config.out / "nonlinearity.png", rows, floors, config)
@@ -168,6 +172,7 @@ def _table(rows, floors, config: Config) -> str:
 
 def _plot(path: Path, rows, floors, config: Config) -> Path:
     size = (8.4 * len(config.noises), 4.2 * len(config.splits))
+    places = range(len(config.levels))
     figure, axes = plt.subplots(
         len(config.splits), 2 * len(config.noises), figsize=size, constrained_layout=True, squeeze=False
     )
@@ -183,13 +188,14 @@ def _plot(path: Path, rows, floors, config: Config) -> Path:
                     ]  # fmt: skip
                     label = _dense.NAMES.get(name, "GPMM, told")
                     shown = {"label": label, "color": COLOURS.get(name)}
-                    axis.plot(config.levels, np.maximum(values, 1e-5), marker="o", ms=3, **shown)
+                    axis.plot(places, np.maximum(values, 1e-5), marker="o", ms=3, **shown)
                 for what, style in (("landmarks", ":"), ("landmarks and face", "--")):
                     some = [f for f in floors if (f["noise_mm"], f["split"]) == (noise, split)]
-                    values = [f[what]["face"] for f in sorted(some, key=lambda f: f["level"])]
-                    axis.plot(config.levels, np.maximum(values, 1e-5), style, color="0.5", label=f"floor: {what}")
+                    values = [f[what]["face"] for f in sorted(some, key=lambda f: config.levels.index(f["level"]))]
+                    axis.plot(places, np.maximum(values, 1e-5), style, color="0.5", label=f"floor: {what}")
                 axis.set(title=f"{split}: registration noise {noise:g}, landmarks off by {off:g} mm", yscale="log",
-                         xlabel="level of realism", xticks=config.levels)  # fmt: skip
+                         xlabel="level of realism", xticks=places)  # fmt: skip
+                axis.set_xticklabels(config.levels)
                 axis.title.set_fontsize(9)
         line[0].set_ylabel("mean vertex error of the face, mm")
     axes[0, 0].legend(frameon=False, fontsize=7)

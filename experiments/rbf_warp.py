@@ -5,7 +5,7 @@ full mesh deformation), and compared with the subject's true meshes: over the he
 mouth and eyes; the angle between true and warped vertex normals of the face tells bumps that millimetres hide. Kernels,
 widths and the affine term are chosen on the validation subjects and judged on the test subjects; so is what
 `facejax.mesh.attachment` adds, an end before the neck and parted lips. Then the paper's system for each frame, and a
-head of another connectivity. Pictures after its figures 4 and 6.
+head of another connectivity. Pictures after its figures 4 and 6. `--data STORE` takes a dataset with 68 landmarks.
 
     python -m experiments.rbf_warp --publish
 
@@ -25,12 +25,13 @@ import numpy as np
 from PIL import Image
 
 from experiments import _run
-from experiments._warped import Face, Form, heat, others, remeshed, sequence, still, weights
+from experiments._warped import Face, Form, heat, others, regions_of, remeshed, sequence, still, weights
 from facejax import files
-from facejax.data import makehuman, makehuman4d, store
+from facejax.data import makehuman4d, store
 from facejax.data.meshes import of_split
 from facejax.geometry import rbf
-from facejax.mesh import graph, ops
+from facejax.io import dress
+from facejax.mesh import ops
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -52,8 +53,10 @@ class Config:
     """Folder for the results."""
     seed: int = 0
     """Of the draw of meshes, and of the other connectivity."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d."""
     level: int = 3
-    """Level of realism."""
+    """Realism of makehuman4d."""
     subjects: int = 120
     """Of the dataset."""
     meshes: int = 20_000
@@ -69,8 +72,8 @@ class Config:
 def run(config: Config) -> dict[str, Any]:
     """Choose on validation subjects, judge on test subjects, draw."""
     begun = time.perf_counter()
-    data = makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
-    regions = _regions()
+    data = _data(config)
+    regions = regions_of(data)
     validation, test = (_draw(data, split, config) for split in ("validation", "test"))
     sweep = [_row(form, validation, regions) for form in _forms(config.quick)]
     chosen = _best(sweep)
@@ -82,7 +85,7 @@ def run(config: Config) -> dict[str, Any]:
         "still": _measure(test, None, regions),
         "test": [_row(form, test, regions) for form in _judged(sweep, chosen)],
         "validation": sweep,
-        "per_frame": _per_frame(data, chosen),
+        "per_frame": _per_frame(data, chosen, regions["face"]),
         "remeshed": {
             "vertices": len(odd.neutral),
             "head_mm": _measure([odd], chosen, {"head": np.arange(len(odd.neutral))})["head"],
@@ -94,7 +97,7 @@ def run(config: Config) -> dict[str, Any]:
     bare = chosen._replace(falloff=False, lips=False)
     shown = {"left still": None, "warped": chosen, "bare": bare}
     pictures = {
-        "heat": heat({name: _errors(test, form)[0] for name, form in shown.items()}),
+        "heat": heat(data, {name: _errors(test, form)[0] for name, form in shown.items()}),
         "sequence": sequence(data, chosen),
         "faces": others(data, chosen, odd),
     }
@@ -107,15 +110,13 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _regions() -> dict[str, np.ndarray]:
-    """Vertices of the head, of the face region, and of the boundary's loops."""
-    shape = makehuman.template()
-    loops = graph.boundary_loops(shape.faces)
-    neck, mouth, *eyes = sorted(loops, key=lambda loop: shape.vertices[loop, 1].mean())
-    return {
-        "head": np.arange(len(shape.vertices)), "face": np.flatnonzero(shape.face_mask),
-        "neck rim": neck, "mouth rim": mouth, "eye rims": np.concatenate(eyes),
-    }  # fmt: skip
+def _data(config: Config) -> store.Store:
+    if config.data is None:
+        return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
+    data = store.open_store(config.data)
+    if len(data.landmark_index) != dress.IBUG:
+        raise ValueError(f"{data.path}: expected {dress.IBUG} landmarks, got {len(data.landmark_index)}")
+    return data
 
 
 def _draw(data: store.Store, split: str, config: Config) -> list[Face]:
@@ -188,9 +189,8 @@ def _best(rows: list[dict[str, Any]]) -> Form:
     return Form(*(best[name] for name in Form._fields))
 
 
-def _per_frame(data: store.Store, form: Form) -> dict[str, float]:
+def _per_frame(data: store.Store, form: Form, face: np.ndarray) -> dict[str, float]:
     """Bare, one system per face and the paper's one per frame, on the drawn meshes of a sequence per test subject."""
-    mask = makehuman.template().face_mask
     found: dict[str, list] = {"once": [], "per_frame": [], "between_them": []}
     for i, s in enumerate(data.subjects("test")):
         takes = [take for take in data.sequences if take.subject == s]
@@ -199,11 +199,13 @@ def _per_frame(data: store.Store, form: Form) -> dict[str, float]:
         marks = neutral[data.landmark_index]
         moved = data.landmarks[take.start : take.start + take.frames] - marks
         first, last = np.searchsorted(data.drawn, [take.start, take.start + take.frames])
+        if first == last:  # no mesh of it was drawn
+            continue
         true, at = data.vertices[first:last] - neutral, data.drawn[first:last] - take.start
         once = np.asarray(rbf.apply(rbf.fit(marks, **form.options), moved, neutral))[at]
         each = rbf.refit(marks, moved, neutral, **form.options)[at]
         for name, a, b in (("once", once, true), ("per_frame", each, true), ("between_them", once, each)):
-            found[name].append(np.linalg.norm(a - b, axis=-1)[:, mask].ravel())
+            found[name].append(np.linalg.norm(a - b, axis=-1)[:, face].ravel())
     return {name: float(np.concatenate(values).mean()) for name, values in found.items()}
 
 
@@ -213,6 +215,8 @@ def _plot(path: Path, sweep: list[dict[str, Any]]) -> Path:
     colours = dict(zip(SIGMAS, ("#c46b4e", "#5b8db8", "#6a9a58", "#8a3fae", "#7a7a7a"), strict=True))
     titles = {"face": "face, mm", "mouth rim": "rim of the mouth, mm", "normals": "normals of the face, degrees"}
     rows = [row for row in sweep if row["lips"] and not row["smoothing"]]
+    if "mouth rim" not in rows[0]["error_mm"]:
+        titles = {"head": "head, mm"} | {name: title for name, title in titles.items() if name != "mouth rim"}
     for axis, (column, title) in zip(axes, titles.items(), strict=True):
         for kernel, affine in dict.fromkeys((row["kernel"], row["affine"]) for row in rows):
             mine = [row for row in rows if (row["kernel"], row["affine"]) == (kernel, affine)]

@@ -1,6 +1,7 @@
 """Speech and free talk carried from one person to others: motion that no method was trained on. OT23, Table 2.
 
     python -m experiments.table2 --recording take.csv --publish
+    python -m experiments.table2 --data STORE --speech STORE
 
 A recording of Live Link Face drives one unseen person; the motion of its landmarks is encoded as an SRVF, put on
 other people's neutral landmarks, scaled to their size, and expanded to their meshes. The truth is how the same
@@ -9,7 +10,9 @@ speech among them. Five passages of the recording. OT23 takes each frame's least
 which flatters; the error frame by frame stands beside it. What the transfer itself costs is told by the methods'
 errors from the person's own landmarks.
 
-`--quick` is a look; `--paper` trains for 300 epochs. A stopped run goes on.
+With `--speech`, a dataset in the topology of `--data`, sentences are its labels: the source says one, and what others
+say under the same label is the truth, stretched to one length; VOCASET, for one. `--quick` is a look; `--paper` trains
+for 300 epochs. A stopped run goes on.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ import numpy as np
 
 from experiments import _cases, _dense, _run, _transferred
 from facejax import drive, methods
-from facejax.data import livelink, makehuman, makehuman4d, performance
+from facejax.data import livelink, makehuman, performance, store
 from facejax.data.meshes import of_split
 
 matplotlib.use("Agg")
@@ -38,14 +41,18 @@ PAPER = {"pca220": 2.90, "dl3dmm": 2.73, "neural3dmm": 3.49, "s2d": 1.48}  # OT2
 
 @dataclasses.dataclass(frozen=True)
 class Config(_dense.Options):
-    recording: Path = dataclasses.field(kw_only=True)
-    """A recording of Live Link Face (CSV)."""
     out: Path = Path("runs/table2")
     """Folder for checkpoints and results."""
+    recording: Path | None = None
+    """A recording of Live Link Face (CSV)."""
+    data: Path | None = None
+    """A prepared dataset to learn from, in place of makehuman4d."""
+    speech: Path | None = None
+    """In place of a recording: a prepared dataset whose recordings are carried from person to person."""
     people: int = 11
     """To how many people the motion is carried."""
     passages: int = 5
-    """How many parts of the recording, spread over it."""
+    """How many parts of the recording, spread over it; or how many labels."""
     seconds: float = 4.0
     """How long each is."""
     methods: tuple[str, ...] = METHODS
@@ -54,34 +61,27 @@ class Config(_dense.Options):
 
 def run(config: Config) -> dict[str, Any]:
     """One row per method and region."""
+    if (config.recording is None) == (config.speech is None):
+        raise ValueError("expected --recording with a recording of Live Link Face, or --speech with a prepared dataset")
     mode = config.mode
     _dense.check_methods(config.methods)
-    data = _cases.data_of(None, mode, level=LEVEL)
+    data = _cases.data_of(config.data, mode, level=LEVEL)
     regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
-    train = _cases.at_most(of_split(data, "train", "validation").of_labels(performance.COMA))
+    train = of_split(data, *(split for split in ("train", "validation") if len(data.subjects(split))))
+    train = _cases.at_most(train.of_labels(performance.COMA) if _cases.is_makehuman(data) else train)
     case = _cases.Case("speech", 0, train, train, "labels")
     options = _dense.options_of(case, mode, config.seed, hierarchy)
-    source, *others = data.subjects("test")[: config.people + 1]
-    if not 1 <= config.people <= len(data.subjects("test")) - 1:
-        raise ValueError(
-            f"--people: expected 1 to {len(data.subjects('test')) - 1} besides the source, got {config.people}"
-        )
-    takes = _passages(config)
-    faces = {index: makehuman.subject(int(index), seed=makehuman4d.SEED) for index in (source, *others)}
-    moved = {index: [_skin(take, faces[index]) for take in takes] for index in faces}
+    pairs = _of_recording(config, data) if config.speech is None else _of_dataset(config, data)
     rows, begun = [], time.perf_counter()
     for name in config.methods:
         fitted = _dense.fitted(name, case, config.folder(), options)
         errors = {"transferred": {}, "own": {}}
-        for index in others:
-            rest = faces[index].vertices
-            for take, true in zip(moved[source], moved[index], strict=True):
-                marks = {"transferred": _transferred.transfer(take, faces[source].vertices, rest, data.landmark_index),
-                         "own": (true - rest)[:, data.landmark_index]}  # fmt: skip
-                for what, landmarks in marks.items():
-                    made = methods.METHODS[name].apply(fitted, landmarks.astype(np.float32), rest)
-                    for region, mask in regions.items():
-                        errors[what].setdefault(region, []).append(_errors(made[:, mask], true[:, mask]))
+        for source, target in pairs:
+            marks = {"transferred": _transferred.onto(source, target, data.landmark_index), "own": target.landmarks}
+            for what, landmarks in marks.items():
+                made = methods.METHODS[name].apply(fitted, landmarks.astype(np.float32), target.rest)
+                for region, mask in regions.items():
+                    errors[what].setdefault(region, []).append(_transferred.errors(made, target, mask, WINDOW))
         for region in regions:
             row = {"method": name, "region": region}
             for what, found in errors.items():
@@ -90,31 +90,46 @@ def run(config: Config) -> dict[str, Any]:
             rows.append(row)
         print(f"{name}: {rows[-len(regions)]}", flush=True)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
-    metrics = {"mode": mode, "recording": config.recording.name, "window": WINDOW, "rows": rows, "paper_mm": PAPER}
+    of = (config.recording or config.speech).name
+    metrics = {"mode": mode, "recording": of, "window": WINDOW, "rows": rows, "paper_mm": PAPER}
     figure = _plot(config.out / "table2.png", rows, config.methods)
     _run.finish("table2", config, metrics, made=made, table=_table(rows, config.methods), figure=figure)
     return metrics
 
 
-def _passages(config: Config) -> list[livelink.Recording]:
+def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+    """(source, target) of every passage and person, test subjects of makehuman4d, as their own rigs move them."""
+    if not _cases.is_makehuman(data):
+        raise ValueError(f"--recording moves people of makehuman4d, and {config.data} has others: use --speech")
+    source, *others = data.subjects("test").tolist()
+    if not 1 <= config.people <= len(others):
+        raise ValueError(f"--people: expected 1 to {len(others)} besides the source, got {config.people}")
     length = float(livelink.read(config.recording).times[-1])
     begins = np.linspace(0.1 * length, 0.9 * length - config.seconds, config.passages)
-    return [drive.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
+    takes = [drive.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
+    faces = {i: makehuman.subject(i, seed=data.index["spec"]["seed"]) for i in (source, *others[: config.people])}
+    moved = {i: [_transferred.posed(take, face, data.landmark_index) for take in takes] for i, face in faces.items()}
+    first = moved.pop(source)
+    return [pair for of_one in moved.values() for pair in zip(first, of_one, strict=True)]
 
 
-def _skin(take: livelink.Recording, person: makehuman.Subject) -> np.ndarray:
-    return drive.posed(take, person)[:, : len(person.vertices)]
-
-
-def _errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """(2, T): each frame's mean vertex distance, and the least of that to the true frames of a window about it."""
-    apart = np.stack([np.linalg.norm(made - np.roll(true, -shift, axis=0), axis=-1).mean(axis=1)
-                      for shift in range(-WINDOW // 2, WINDOW // 2 + 1)])  # fmt: skip
-    frames = np.arange(len(made))
-    for i, shift in enumerate(range(-WINDOW // 2, WINDOW // 2 + 1)):
-        outside = (frames + shift < 0) | (frames + shift >= len(made))
-        apart[i, outside] = np.inf
-    return np.stack([apart[WINDOW // 2], apart.min(axis=0)])
+def _of_dataset(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+    """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
+    talk = store.open_store(config.speech)
+    if not np.array_equal(talk.faces, data.faces):
+        raise ValueError(f"{talk.path} and {data.path} have other triangles: both have to be in one topology")
+    people = talk.subjects("test") if len(talk.subjects("test")) > 1 else np.arange(len(talk.neutral))
+    source, *others = people[: config.people + 1].tolist()
+    labels = [label for label in talk.labels[1:] if _transferred.stored(talk, source, label)][: config.passages]
+    pairs = [
+        (_transferred.stored(talk, source, label), target)
+        for label in labels
+        for other in others
+        if (target := _transferred.stored(talk, other, label)) is not None
+    ]
+    if not pairs:
+        raise ValueError(f"{talk.path}: expected two or more people with recordings of one label, and meshes of them")
+    return pairs
 
 
 def _value(rows, method: str, region: str, what: str) -> float:

@@ -6,8 +6,7 @@ leaves ridge regression out of its tables; it is the honest bar, exact on level 
 
     python -m experiments.unseen_subjects --publish
 
-S2D-Dec of level 3 is the released one (`experiments.pretrain`); the others are trained here with the same plan, and
-a stopped training goes on when called again. About an hour on 2 cores."""
+S2D-Dec is trained on each; a stopped training goes on when called again. About an hour on 2 cores."""
 
 from __future__ import annotations
 
@@ -20,18 +19,16 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _run
-from facejax import evaluation, fit_decoder, journal, pipeline
-from facejax.data import cache, makehuman, makehuman4d, rig
+from experiments import _cases, _run
+from facejax import evaluation, fit_decoder, journal
+from facejax.data import makehuman4d, rig, store
 from facejax.data.meshes import Meshes, of_split
-from facejax.mesh import topology
 from facejax.models import decoder, linear
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 METHODS = ("ridge", "pca220", "s2d")
-RELEASED_LEVEL = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,14 +37,16 @@ class Config:
     """Folder for checkpoints and results."""
     seed: int = 0
     """Of the decoders."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d and its levels."""
     levels: tuple[int, ...] = rig.LEVELS
     """Levels of realism."""
     subjects: int = 120
     """Of the dataset."""
     meshes: int = 20_000
     """Of the dataset."""
-    steps: int | None = None
-    """Decoder steps on the levels that are trained here; by default as many as the released decoder had."""
+    steps: int = fit_decoder.Plan().steps
+    """Of S2D-Dec."""
     publish: bool = False
     """Also write the figures that the README quotes."""
 
@@ -55,46 +54,50 @@ class Config:
 def run(config: Config) -> dict[str, Any]:
     """One row per level, method and region."""
     begun = time.perf_counter()
-    models = pipeline.load()
-    released = models.about["plans"]["decoder"]["steps"]
-    plan = fit_decoder.Plan(steps=config.steps or released)
-    rows = []
-    for level in config.levels:
-        data = makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
+    rows, levels = [], config.levels
+    if config.data is not None:
+        levels = (config.data.name,)
+    for level in levels:
+        data = _data(config, level)
         train, test = of_split(data, "train"), of_split(data, "test")
-        mask = makehuman.template().face_mask
-        regions = {"head": np.ones_like(mask), "face": mask}
+        regions = _cases.regions_of(data)
         for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
             params, alpha = evaluation.fit_linear(model, train, **options)
             found = evaluation.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
             rows += _rows(level, name, found, {"alpha_mm2": alpha})
-        decode, training = _decoder(config, level, train, plan, models, released)
+        decode, training = _decoder(config, level, train)
         rows += _rows(level, "s2d", evaluation.vertex_errors(decode, test, regions), training)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     metrics = {"rows": rows}
-    figure = _plot(config.out / "unseen_subjects.png", rows, config.levels)
-    _run.finish("unseen_subjects", config, metrics, made=made, table=_table(rows, config.levels), figure=figure)
+    figure = _plot(config.out / "unseen_subjects.png", rows, levels)
+    _run.finish("unseen_subjects", config, metrics, made=made, table=_table(rows, levels), figure=figure)
     return metrics
 
 
-def _decoder(config: Config, level: int, train: Meshes, plan: fit_decoder.Plan, models, released: int):
-    if level == RELEASED_LEVEL and config.steps is None:
-        hierarchy, params, steps = models.hierarchy, models.decoder, released
-        seconds = models.about["seconds"]["decoder"]
-    else:
-        shape = makehuman.template()
-        hierarchy = jax.device_put(topology.build(shape.vertices, shape.faces, cache=cache.folder()))
-        folder = config.out / f"level{level}"
-        params = fit_decoder.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
-        steps, seconds = plan.steps, sum(entry["seconds"] for entry in journal.read(folder))
-    return (lambda marks: decoder.apply(params, hierarchy, marks)), {"steps": steps, "train_seconds": round(seconds, 1)}
+def _data(config: Config, level: int | str) -> store.Store:
+    if config.data is not None:
+        return store.open_store(config.data)
+    return makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
 
 
-def _rows(level: int, method: str, found: dict[str, Any], more: dict[str, Any]) -> list[dict[str, Any]]:
+def _named(level: int | str) -> str:
+    return level if isinstance(level, str) else f"level {level}"
+
+
+def _decoder(config: Config, level: int | str, train: Meshes):
+    hierarchy = jax.device_put(_cases.hierarchy_of(train.data))
+    folder, plan = config.out / _named(level).replace(" ", ""), fit_decoder.Plan(steps=config.steps)
+    params = fit_decoder.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
+    seconds = sum(entry["seconds"] for entry in journal.read(folder))
+    about = {"steps": plan.steps, "train_seconds": round(seconds, 1)}
+    return (lambda marks: decoder.apply(params, hierarchy, marks)), about
+
+
+def _rows(level: int | str, method: str, found: dict[str, Any], more: dict[str, Any]) -> list[dict[str, Any]]:
     return [{"level": level, "method": method, "region": region, **row, **more} for region, row in found.items()]
 
 
-def _value(rows, level: int, method: str, region: str) -> float:
+def _value(rows, level: int | str, method: str, region: str) -> float:
     return next(r["mean_mm"] for r in rows if (r["level"], r["method"], r["region"]) == (level, method, region))
 
 
@@ -105,7 +108,7 @@ def _table(rows, levels) -> str:
             "{:.4f} / {:.4f}".format(*(_value(rows, level, method, region) for region in ("head", "face")))
             for method in METHODS
         ]
-        body.append((f"level {level}", *cells))
+        body.append((_named(level), *cells))
     header = ("mean vertex error, mm: head / face", "ridge", "PCA-220", "S2D-Dec")
     return _run.markdown(header, body)
 
@@ -117,7 +120,7 @@ def _plot(path: Path, rows, levels) -> Path:
         for i, method in enumerate(METHODS):
             values = [_value(rows, level, method, region) for level in levels]
             axis.bar(np.arange(len(levels)) + 0.26 * (i - 1), values, 0.26, label=method, color=colours[method])
-        axis.set_xticks(range(len(levels)), [f"level {level}" for level in levels])
+        axis.set_xticks(range(len(levels)), [_named(level) for level in levels])
         axis.set_title(region)
     axes[0].set_ylabel("mean vertex error, mm")
     axes[0].legend(frameon=False)

@@ -36,8 +36,10 @@ class Params(NamedTuple):
     tables: strain.Around
 
 
-def apply(params: Params, displacements: jax.Array, neutral: np.ndarray) -> jax.Array:
+def apply(params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True) -> jax.Array:
     """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
+
+    Without `refined` the linear answer alone, which is one product of matrices.
 
     Raises `ValueError` for other shapes, and for a face that is traced: each is prepared on the host.
     """
@@ -46,6 +48,8 @@ def apply(params: Params, displacements: jax.Array, neutral: np.ndarray) -> jax.
             "neutral: every face is prepared on the host, so that it cannot be traced: leave it out of jit"
         )
     base = linear.apply(on_face(params.base, np.asarray(neutral)), jnp.asarray(displacements))
+    if not refined:
+        return base
     lead = base.shape[:-2]
     flat = base.reshape(-1, *base.shape[-2:])
     marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), -1, 3)

@@ -35,8 +35,7 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = topology.build(mean, faces)
     known = motions.join(*fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.CHARTED))
-    # A quarter as many directions as there are motions: in directions that few of them take, the flow strays.
-    chart = fit_motion.chart_of(known, labels=len(data.labels), rank=min(RANK, len(known.start) // 4))
+    chart = fit_motion.chart_of(known, labels=len(data.labels), rank=rank_of(known))
     examples = fit_motion.examples_of(
         chart, fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.SPREAD)
     )
@@ -57,6 +56,14 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
         about={"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
         | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}},
     )
+
+
+def rank_of(known: motions.Motions) -> int:
+    """How many directions of motion to learn: a quarter as many as there are motions, where these are few.
+
+    In directions that few of them take, the flow strays.
+    """
+    return min(RANK, len(known.start) // 4)
 
 
 def check(data: store.Store) -> None:

@@ -159,7 +159,7 @@ def fit_gan(
     Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
     and another plan in it is refused.
     """
-    config = _sized(config, chart)
+    config = sized(config, chart)
     _claim(folder, "gan", plan, config, seed, examples.values)
     generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
     players = steps.Players(
@@ -204,7 +204,7 @@ def fit_flow(
     Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
     exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
     """
-    config = _sized(config, chart)
+    config = sized(config, chart)
     _claim(folder, "flow", plan, config, seed, examples.values)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     weights = flow.init(init_key, chart, config=config).weights
@@ -311,7 +311,8 @@ def _run(step, state, examples: Examples, chart, folder, count: int, batch: int,
     )
 
 
-def _sized(config, chart: charts.Chart):
+def sized(config, chart: charts.Chart):
+    """A network's config with the sizes that the chart knows."""
     (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
     return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
 

@@ -149,13 +149,18 @@ def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ..
     return tuple(int(n) for n in found)
 
 
-def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array) -> jax.Array:
-    """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3)."""
+def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array, *, refined: bool = True) -> jax.Array:
+    """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3).
+
+    Without `refined` the linear answer alone (`facejax.expand`): much faster, and little worse. Nothing to S2D-Dec.
+    """
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
         raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
     if isinstance(models.decoder, expand.Params):
-        return jnp.asarray(neutral, jnp.float32) + expand.apply(models.decoder, landmarks - rest, neutral)
+        return jnp.asarray(neutral, jnp.float32) + expand.apply(
+            models.decoder, landmarks - rest, neutral, refined=refined
+        )
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 
 

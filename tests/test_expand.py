@@ -45,6 +45,7 @@ def test_it_is_the_linear_answer_and_the_networks_share(params, person):
     assert np.abs(found - base).max() > 1e-3
     closed = params._replace(network=params.network._replace(gate=jnp.zeros(())))
     np.testing.assert_array_equal(expand.apply(closed, marks, neutral), base)
+    np.testing.assert_array_equal(expand.apply(params, marks, neutral, refined=False), base)
 
 
 @pytest.mark.parametrize("lead", [(), (1,), (3, 2), (37,)], ids=str)

@@ -1,0 +1,39 @@
+"""OT23's classifier of transitions (4.3): which pair of labels does a motion show?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from sklearn.ensemble import RandomForestClassifier
+
+from experiments import _judged
+from facejax import fit_motion
+from facejax.data import motions
+
+
+def forest(config: _judged.People, names: Sequence[_judged.Names], trees: int = 300) -> RandomForestClassifier:
+    """OT23's classifier: 30 x 204 displacements from neutral, unitless, of training people's transitions -> which pair.
+
+    Its training set is the one of OT23: halves, and transitions selected by prototypes.
+    """
+    data = _judged.data_of(config)
+    pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in names]
+    train, which = labelled(fit_motion.transitions(data, "train"), pairs)
+    found = RandomForestClassifier(trees, random_state=config.seed, n_jobs=-1)
+    return found.fit(train.curves.reshape(len(which), -1), which)
+
+
+def labelled(found: motions.Motions, pairs: Sequence[_judged.Pair]) -> tuple[motions.Motions, np.ndarray]:
+    """The motions of the given pairs, and which pair each is."""
+    number = {pair: i for i, pair in enumerate(pairs)}
+    which = np.array([number.get(pair, -1) for pair in zip(found.start.tolist(), found.end.tolist(), strict=True)])
+    return found.take(which >= 0), which[which >= 0]
+
+
+def recognised(classifier: RandomForestClassifier, curves: Sequence[np.ndarray], scale: float) -> list[float]:
+    """The share of each pair's curves (in mm) that are named rightly."""
+    shares = []
+    for i, found in enumerate(curves):
+        shares.append(float(np.mean(classifier.predict(found.reshape(len(found), -1) / scale) == i)))
+    return shares
