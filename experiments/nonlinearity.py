@@ -112,7 +112,7 @@ def _told_and_floor(case, options: methods.Options, regions) -> dict[float, _den
     ridge = methods.METHODS["ridge"].fit(case.train, Path(), options).params
     floors, told = _floors(case, fitted.params, ridge, regions), {}
     for noise in LANDMARK_NOISE:
-        params = fitted.params._replace(prior=fitted.params.prior._replace(noise=fitted.params.prior.noise + noise**2))
+        params = gpmm.told(fitted.params, noise)
         distances = evaluation.distances(
             lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.on_face(p, rest), marks)),
             case.test, regions, noise=noise,

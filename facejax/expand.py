@@ -23,8 +23,8 @@ from facejax.models import gpmm, linear, residual
 
 BATCH = 16
 FACES = 8  # remembered
-# What was asked for last: the model and its map of a face, by the model's identity and the face's bytes.
-_prepared: OrderedDict[tuple[int, str], tuple[gpmm.Params, linear.Params]] = OrderedDict()
+# What was asked for last: the model and its map of a face, by the model's identity, the face's bytes and the noise.
+_prepared: OrderedDict[tuple[int, str, float], tuple[gpmm.Params, linear.Params]] = OrderedDict()
 
 
 class Params(NamedTuple):
@@ -36,10 +36,14 @@ class Params(NamedTuple):
     tables: strain.Around
 
 
-def apply(params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True) -> jax.Array:
+def apply(
+    params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True, noise: float = 0.0
+) -> jax.Array:
     """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
 
-    Without `refined` the linear answer alone, which is one product of matrices.
+    Without `refined` the linear answer alone, which is one product of matrices. `noise` tells by how many mm the
+    landmarks are off in every coordinate, such as those of a detector: the linear answer takes it into account, and
+    goes unrefined, since the network has learnt from landmarks that are right.
 
     Raises `ValueError` for other shapes, and for a face that is traced: each is prepared on the host.
     """
@@ -47,8 +51,8 @@ def apply(params: Params, displacements: jax.Array, neutral: np.ndarray, *, refi
         raise ValueError(
             "neutral: every face is prepared on the host, so that it cannot be traced: leave it out of jit"
         )
-    base = linear.apply(on_face(params.base, np.asarray(neutral)), jnp.asarray(displacements))
-    if not refined:
+    base = linear.apply(on_face(params.base, np.asarray(neutral), noise), jnp.asarray(displacements))
+    if noise or not refined:
         return base
     lead = base.shape[:-2]
     flat = base.reshape(-1, *base.shape[-2:])
@@ -57,12 +61,12 @@ def apply(params: Params, displacements: jax.Array, neutral: np.ndarray, *, refi
     return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
 
 
-def on_face(base: gpmm.Params, neutral: np.ndarray) -> linear.Params:
-    """`gpmm.on_face`, remembered."""
-    key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest()
+def on_face(base: gpmm.Params, neutral: np.ndarray, noise: float = 0.0) -> linear.Params:
+    """`gpmm.on_face` of a model that is `gpmm.told` of landmark noise in mm, remembered."""
+    key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest(), noise
     if key not in _prepared:
         # The model is kept with its answer: no other can then have its identity.
-        _prepared[key] = base, gpmm.on_face(base, neutral)
+        _prepared[key] = base, gpmm.on_face(gpmm.told(base, noise), neutral)
         while len(_prepared) > FACES:
             _prepared.popitem(last=False)
     _prepared.move_to_end(key)

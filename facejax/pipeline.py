@@ -149,18 +149,28 @@ def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ..
     return tuple(int(n) for n in found)
 
 
-def meshes(models: Models, landmarks: jax.Array, neutral: np.ndarray | jax.Array, *, refined: bool = True) -> jax.Array:
+def meshes(
+    models: Models,
+    landmarks: jax.Array,
+    neutral: np.ndarray | jax.Array,
+    *,
+    refined: bool = True,
+    noise: float = 0.0,
+) -> jax.Array:
     """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3).
 
-    Without `refined` the linear answer alone (`facejax.expand`): much faster, and little worse. Nothing to S2D-Dec.
+    Without `refined` the linear answer alone, much faster and little worse; `noise` tells by how many mm landmarks are
+    off, such as those of a detector. Both as in `expand.apply`; S2D-Dec knows neither, and refuses `noise`.
     """
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
         raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
     if isinstance(models.decoder, expand.Params):
         return jnp.asarray(neutral, jnp.float32) + expand.apply(
-            models.decoder, landmarks - rest, neutral, refined=refined
+            models.decoder, landmarks - rest, neutral, refined=refined, noise=noise
         )
+    if noise:
+        raise ValueError("noise: S2D-Dec cannot be told of it; the best linear answer can (`facejax.expand`)")
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 
 

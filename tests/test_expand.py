@@ -83,6 +83,20 @@ def test_another_prior_is_another_model(params, person):
     np.testing.assert_array_equal(expand.apply(closed, marks, neutral), first)
 
 
+def test_told_of_noise_it_trusts_landmarks_less(params, person):
+    neutral, marks, moved = person
+    noisy = (marks + 2 * np.random.default_rng(0).standard_normal(marks.shape)).astype(np.float32)
+    errors = [np.linalg.norm(np.asarray(expand.apply(params, noisy, neutral, noise=noise)) - moved, axis=-1).mean()
+              for noise in (0.0, 2.0)]  # fmt: skip
+    assert errors[1] < 0.8 * errors[0]
+    trusting = expand.apply(params, marks, neutral, noise=1e-6)
+    np.testing.assert_allclose(trusting, expand.apply(params, marks, neutral, refined=False), atol=1e-4)
+    with pytest.raises(ValueError, match="noise: expected 0 mm or more, got -1"):
+        expand.apply(params, marks, neutral, noise=-1)
+    with pytest.raises(ValueError, match="kept as one map"):
+        gpmm.told(params.base._replace(statistics=linear.Params(jnp.zeros((5, 3)), jnp.zeros((162, 3)), ())), 0.5)
+
+
 def test_a_traced_face_is_refused(params, person):
     neutral, marks, _ = person
     with pytest.raises(ValueError, match="every face is prepared on the host"):

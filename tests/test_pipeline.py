@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from facejax import pipeline, weights
-from facejax.data import makehuman, performance
-from facejax.models import generators, motion, motion_reference
+from facejax.data import makehuman, makehuman4d, performance, rig
+from facejax.models import decoder, generators, motion, motion_reference
 from tests.models.test_motion import plain_weights
 
 
@@ -52,6 +52,38 @@ def test_meshes_carry_the_landmarks_and_hold_still_at_rest(models, person):
     assert np.linalg.norm(carried - np.asarray(moved), axis=-1).mean() < 0.6
     back = np.linalg.norm(vertices[-1] - person.vertices, axis=-1)
     assert back[np.asarray(models.face.mask)].mean() > 3 * back[~np.asarray(models.face.mask)].mean()
+
+
+def test_meshes_unrefined_and_of_a_detectors_landmarks(models, person):
+    """Against the person's own rig: the network gains little, and who is told of noise loses little."""
+    rest, at = person.vertices, np.asarray(models.face.landmark_index)
+    weights_of = performance.perform("happiness", 103, seed=makehuman4d.SEED).weights[::6]
+    true = rig.pose(rig.build(person, level=3), weights_of)[:, : len(rest)]
+    noisy = (true[:, at] + 0.5 * np.random.default_rng(0).standard_normal((len(true), 68, 3))).astype(np.float32)
+
+    def error(marks, **options):
+        return np.linalg.norm(np.asarray(pipeline.meshes(models, marks, rest, **options)) - true, axis=-1).mean()
+
+    right, plain = error(true[:, at]), error(true[:, at], refined=False)
+    assert right < plain < 1.5 * right and plain < 0.05
+    assert error(noisy, noise=0.5) < 0.3 * error(noisy)
+
+
+def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):
+    params = decoder.init(jax.random.key(0), models.hierarchy)
+    path = tmp_path / "s2d.safetensors"
+    pipeline.save(path, models._replace(decoder=params))
+    again = pipeline.load(path)
+    assert again.about["decoder"] == pipeline.S2D and isinstance(again.decoder, decoder.Params)
+    marks = pipeline.landmarks(again, KEY, ["neutral", "anger"], person.vertices, frames=3)
+    moved = marks - pipeline.neutral_landmarks(again, person.vertices)
+    expected = person.vertices + np.asarray(decoder.apply(params, models.hierarchy, moved))
+    np.testing.assert_allclose(pipeline.meshes(again, marks, person.vertices), expected, atol=1e-3)
+    # It sees no face, so that all of it goes into one program.
+    traced = jax.jit(lambda marks, face: pipeline.meshes(again, marks, face))(marks, person.vertices)
+    np.testing.assert_allclose(traced, expected, atol=1e-3)
+    with pytest.raises(ValueError, match="S2D-Dec cannot be told of it"):
+        pipeline.meshes(again, marks, person.vertices, noise=0.5)
 
 
 def test_same_key_same_motion_and_samples_differ(models, person):

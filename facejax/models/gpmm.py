@@ -105,6 +105,18 @@ def carry_to(person: Person, faces: np.ndarray, face: np.ndarray, hold: np.ndarr
     return transfer.settle(there, back, person.vertices).astype(np.float32)
 
 
+def told(params: Params, noise: float) -> Params:
+    """The model that knows landmarks to be off by so many mm in every coordinate, as a detector's are.
+
+    Raises `ValueError` for noise below 0, and for a model of which only the map was kept.
+    """
+    if not noise >= 0:
+        raise ValueError(f"noise: expected 0 mm or more, got {noise}")
+    if noise and isinstance(params.statistics, linear.Params):
+        raise ValueError("noise: this model was kept as one map, which was made for landmarks that are right")
+    return params._replace(prior=params.prior._replace(noise=params.prior.noise + noise**2))
+
+
 def on_face(params: Params, neutral: np.ndarray) -> linear.Params:
     """The map of one face (N, 3): what `linear.apply` takes. Raises `ValueError` for a face of another shape."""
     if isinstance(params.statistics, linear.Params):
