@@ -2,12 +2,14 @@
 
     python -m benchmarks.pipeline [--json FILE]
 
-About a minute.
+As released, by the linear answer alone (`refined=False`), and by S2D-Dec of the same hierarchy. What a face that was
+not seen before costs once is told apart. About a minute.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
@@ -20,6 +22,7 @@ import tyro
 
 from benchmarks import _measure
 from facejax import pipeline
+from facejax.models import decoder, gpmm
 
 FRESH = """
 import time
@@ -47,20 +50,23 @@ def run(config: Config) -> list[dict]:
     models = pipeline.load()
     neutral, labels = models.face.vertices, ["neutral", "high_smile"]
 
-    def frames():
-        landmarks = pipeline.landmarks(models, jax.random.key(0), labels, neutral)
-        return pipeline.meshes(models, landmarks, neutral)
+    spiral = models._replace(decoder=decoder.init(jax.random.key(0), models.hierarchy))
 
-    def batch():
-        landmarks = pipeline.landmarks(models, jax.random.key(0), labels, neutral, samples=16)
-        return pipeline.meshes(models, landmarks, neutral)
+    def made(models, samples, **options):
+        landmarks = pipeline.landmarks(models, jax.random.key(0), labels, neutral, samples=samples)
+        return pipeline.meshes(models, landmarks, neutral, **options)
 
-    found = _measure.interleaved(
-        {"labels_to_30_meshes": frames, "16_requests_of_30_meshes": batch}, repeats=5 if config.quick else 20
-    )
+    ways = {"refined": (models, {}), "linear": (models, {"refined": False}), "s2d": (spiral, {})}
+    calls = {
+        f"{way}_{samples}x30_meshes": functools.partial(made, of, samples, **options)
+        for way, (of, options) in ways.items()
+        for samples in (1, 16)
+    }
+    calls["new_face"] = lambda: gpmm.on_face(models.decoder.base, neutral)
+    found = _measure.interleaved(calls, repeats=5 if config.quick else 20)
     rows = [{"name": name, **times} for name, times in found.items()]
-    for row, meshes in zip(rows, (30, 480), strict=True):
-        row["meshes_per_s"] = meshes / row["median_s"]
+    for row in rows[:-1]:
+        row["meshes_per_s"] = 30 * (16 if "_16x" in row["name"] else 1) / row["median_s"]
     with tempfile.TemporaryDirectory() as folder:
         for name in ("fresh_process_empty_cache", "fresh_process_warm_cache"):
             rows.append({"name": name, "first_s": _fresh(folder)})
