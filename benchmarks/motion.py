@@ -42,7 +42,7 @@ import numpy as np
 import tyro
 
 from benchmarks import _measure, _transitions
-from facejax import augment, fit_motion, steps, training
+from facejax import augment, fit_motion, motion_examples, steps, training
 from facejax.data.motions import Motions
 from facejax.models import charts, flow, generators, motion, motion_reference
 
@@ -105,8 +105,8 @@ def run(config: Config) -> list[dict]:
         torch.set_num_threads(config.threads)
     sizes = {name: getattr(config.gan, name) for name in ("labels", "steps", "landmarks")}
     known = _transitions.made_up(config.motions, **sizes)
-    chart = fit_motion.chart_of(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
-    examples = fit_motion.examples_of(chart, [known])
+    chart = motion_examples.chart_of(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
+    examples = motion_examples.examples_of(chart, [known])
     gan = handed(fit_motion.fit_gan, examples, chart, plan=config.gan_plan, config=config.gan)
     field = handed(fit_motion.fit_flow, examples, chart, plan=config.flow_plan, config=config.flow)
     rows = _steps("GAN step", gan, config, config.gan_plan, "Gan")

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from experiments import _judged, _recognised, _run
-from facejax import fit_motion
+from facejax import motion_examples
 from facejax.data import makehuman4d, motions
 
 # OT23's Table 5, in per cent; on CoMA, with another forest and other data.
@@ -73,7 +73,7 @@ def _selected(config: Config) -> motions.Motions:
     halves = _judged.halves_of(config, "test")
     onsets = halves.take(halves.start == 0)
     count = len(_judged.data_of(config).labels)
-    chosen = motions.interpolated(onsets, count, per_pair=fit_motion.PER_PAIR, reuse=1)
+    chosen = motions.interpolated(onsets, count, per_pair=motion_examples.PER_PAIR, reuse=1)
     return motions.join(halves, *chosen)
 
 

@@ -24,7 +24,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _judged, _recognised, _run
-from facejax import fit_models, fit_motion, journal, pipeline
+from facejax import fit_motion, journal, motion_examples, pipeline
 from facejax.data import motions
 from facejax.models import flow, motion_reference
 
@@ -136,16 +136,16 @@ def chosen(table: dict[str, dict[str, Any]], real: dict[str, Any]) -> str:
     return min(inside, key=lambda name: table[name]["energy"])
 
 
-def _examples(data, source: str) -> tuple[motions.Motions, Any, fit_motion.Examples]:
+def _examples(data, source: str) -> tuple[motions.Motions, Any, motion_examples.Examples]:
     """Motions to fit a chart on, the chart, and all motions in it."""
     labels = len(data.labels)
     if source == "prototypes":
-        known = fit_motion.transitions(data, "train")
-        chart = fit_motion.chart_of(known, labels=labels, rank=fit_models.rank_of(known))
-        return known, chart, fit_motion.examples_of(chart, [known])
-    known = motions.join(*fit_motion.everything(data, "train", per_pair=fit_motion.CHARTED))
-    chart = fit_motion.chart_of(known, labels=labels, rank=fit_models.rank_of(known))
-    return known, chart, fit_motion.examples_of(chart, fit_motion.everything(data, "train"))
+        known = motion_examples.transitions(data, "train")
+        chart = motion_examples.chart_of(known, labels=labels, rank=motion_examples.rank_of(known))
+        return known, chart, motion_examples.examples_of(chart, [known])
+    known = motions.join(*motion_examples.everything(data, "train", per_pair=motion_examples.CHARTED))
+    chart = motion_examples.chart_of(known, labels=labels, rank=motion_examples.rank_of(known))
+    return known, chart, motion_examples.examples_of(chart, motion_examples.everything(data, "train"))
 
 
 def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.Models, path: Path) -> None:
@@ -168,7 +168,7 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
         plan = fit_motion.REFERENCE._replace(steps=config.reference_steps, batch=config.reference_batch)
         eighth = motion_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
-    beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train"))
+    beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train"))
     models = lent._replace(motion=generator, starts=beginnings)
     # Of the steps alone, over all runs that it took: compiling and preparing are the same for all.
     seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in journal.read(folder))
@@ -180,7 +180,7 @@ def _judge(config: Config):
     """A function from models, or None for real people, to the mean figures on validation people."""
     names = _judged.names_of(_judged.data_of(config))
     real = _judged.held(config, "validation", names)
-    train = _judged.seen(config, real.pairs, real.scale, 3 * fit_motion.CHARTED)
+    train = _judged.seen(config, real.pairs, real.scale, 3 * motion_examples.CHARTED)
     forest = _recognised.forest(config, names)
 
     def judge(models: pipeline.Models | None) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from experiments import _cases, _recognised, _run
 from experiments import _interpolated as made_of
 from experiments import _interpolated_drawn as drawn
 from experiments._interpolated import PACES, PATHS, WAYS
-from facejax import augment, files, fit_motion
+from facejax import augment, files, motion_examples
 from facejax.data import makehuman4d, motions, store
 
 HELD_OUT = ("validation", "test")
@@ -178,10 +178,10 @@ def _recognition(config: Config, data: store.Store, direct: motions.Motions) -> 
 
 
 def _selected(onsets: motions.Motions, wanted: set[tuple[int, int]], labels: int) -> np.ndarray:
-    """The pairs of onsets (P, 2) that `fit_motion.transitions` takes: nearest to the mean peaks."""
+    """The pairs of onsets (P, 2) that `motion_examples.transitions` takes: nearest to the mean peaks."""
     peaks = onsets.curves[:, -1]
     prototypes = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
-    chosen = augment.select(peaks, onsets.end - 1, prototypes, per_pair=fit_motion.PER_PAIR, reuse=1).pairs
+    chosen = augment.select(peaks, onsets.end - 1, prototypes, per_pair=motion_examples.PER_PAIR, reuse=1).pairs
     ends = zip(*onsets.end[chosen].T.tolist(), strict=True)
     return chosen[[pair in wanted for pair in ends]]
 

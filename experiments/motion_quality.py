@@ -23,7 +23,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _judged, _run
-from facejax import fit_motion, metrics, pipeline
+from facejax import metrics, motion_examples, pipeline
 from facejax.data import motions
 
 matplotlib.use("Agg")
@@ -55,7 +55,7 @@ def run(config: Config) -> dict[str, Any]:
     models = pipeline.load(config.model)
     _judged.fits(models, data, config.model or "the released models")
     held_out = [split for split in ("validation", "test") if len(data.subjects(split))]
-    real = motions.join(*(part for split in held_out for part in fit_motion.everything(data, split, per_pair=20)))
+    real = motions.join(*(part for split in held_out for part in motion_examples.everything(data, split, per_pair=20)))
     pairs = sorted(set(zip(real.start.tolist(), real.end.tolist(), strict=True)))
     keys = jax.random.split(jax.random.key(config.seed), len(pairs))
     trained_on = motions.halves(data, "train")

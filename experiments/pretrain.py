@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments import _run
-from facejax import fit_decoder, fit_gpmm, fit_models, fit_motion, fit_residual, pipeline
+from facejax import fit_decoder, fit_gpmm, fit_models, fit_motion, fit_residual, motion_examples, pipeline
 from facejax.data import assets, cache, makehuman, makehuman4d, motions, performance, store
 from facejax.data.meshes import of_split
 from facejax.mesh import topology
@@ -168,16 +168,16 @@ def _motion(config: Config, data: store.Store):
         if config.onsets_only:
             halves = motions.halves(data, "train", names=names)
             return [halves.take(halves.start == 0)]
-        return fit_motion.everything(data, "train", names=names, per_pair=per_pair)
+        return motion_examples.everything(data, "train", names=names, per_pair=per_pair)
 
     folder = config.out / "motion"
     fit = fit_motion.fit_flow if config.generator == "flow" else fit_motion.fit_gan
     with _timed(folder) as seconds:
-        known = motions.join(*parts(fit_motion.CHARTED))
-        chart = fit_motion.chart_of(known, labels=len(names))
-        examples = fit_motion.examples_of(chart, parts(fit_motion.SPREAD))
+        known = motions.join(*parts(motion_examples.CHARTED))
+        chart = motion_examples.chart_of(known, labels=len(names))
+        examples = motion_examples.examples_of(chart, parts(motion_examples.SPREAD))
         generator = fit(examples, chart, folder, plan=_motion_plan(config), seed=config.seed)
-    beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train", names=names))
+    beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train", names=names))
     return (generator, beginnings), seconds()
 
 

@@ -12,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import evaluation, fit_gpmm, fit_motion, fit_residual, pipeline
+from facejax import evaluation, fit_gpmm, fit_motion, fit_residual, motion_examples, pipeline
 from facejax.data import makehuman, meshes, motions, store
 from facejax.io import dress
 from facejax.mesh import attachment, topology
 
-RANK = 128  # directions of motion, where there are enough motions to tell
 FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
 
 
@@ -34,13 +33,15 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = topology.build(mean, faces)
-    known = motions.join(*fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.CHARTED))
-    chart = fit_motion.chart_of(known, labels=len(data.labels), rank=rank_of(known))
-    examples = fit_motion.examples_of(
-        chart, fit_motion.everything(data, "train", names=data.labels, per_pair=fit_motion.SPREAD)
+    known = motions.join(
+        *motion_examples.everything(data, "train", names=data.labels, per_pair=motion_examples.CHARTED)
+    )
+    chart = motion_examples.chart_of(known, labels=len(data.labels), rank=motion_examples.rank_of(known))
+    examples = motion_examples.examples_of(
+        chart, motion_examples.everything(data, "train", names=data.labels, per_pair=motion_examples.SPREAD)
     )
     generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed)
-    beginnings = fit_motion.fit_starts(chart, motions.halves(data, "train"))
+    beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train"))
     train = meshes.of_split(data, "train")
     # As many components as the file will hold: the network refines the very answer that it will meet.
     base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
@@ -56,14 +57,6 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
         about={"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
         | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}},
     )
-
-
-def rank_of(known: motions.Motions) -> int:
-    """How many directions of motion to learn: a quarter as many as there are motions, where these are few.
-
-    In directions that few of them take, the flow strays.
-    """
-    return min(RANK, len(known.start) // 4)
 
 
 def check(data: store.Store) -> None:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks import _measure, _transitions, lstm, motion
-from facejax import fit_motion, training
+from facejax import fit_motion, motion_examples, training
 from facejax.models import flow
 from facejax.models import motion as gan
 
@@ -123,10 +123,10 @@ def test_motion_peer_takes_the_same_steps(name, fit):
 
     sizes = {field: getattr(TINY.gan, field) for field in ("labels", "steps", "landmarks")}
     known = _transitions.made_up(TINY.motions, **sizes)
-    chart = fit_motion.chart_of(known, labels=3, rank=8, pose=3)
+    chart = motion_examples.chart_of(known, labels=3, rank=8, pose=3)
     kind = name.lower()
     plan, config = getattr(TINY, f"{kind}_plan"), getattr(TINY, kind)
-    run = motion.handed(fit, fit_motion.examples_of(chart, [known]), chart, plan=plan, config=config)
+    run = motion.handed(fit, motion_examples.examples_of(chart, [known]), chart, plan=plan, config=config)
     program, _ = motion.compiled(run)
     peer = getattr(_motion_torch, name)
     _motion_torch.check(peer(run.state, run.held, plan), program, run.state, run.rows, run.held)

@@ -19,7 +19,7 @@ from experiments import (
     specificity,
     unseen_subjects,
 )
-from facejax import augment, evaluation, expressions, fit_motion
+from facejax import augment, evaluation, expressions, motion_examples
 from facejax.data import makehuman4d, motions
 
 TINY = {"subjects": 6, "meshes": 260}
@@ -109,8 +109,8 @@ PEOPLE = {"level": 1, "people": 6, **TINY}
 
 
 def test_generators(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit_motion, "SPREAD", 2)
-    monkeypatch.setattr(fit_motion, "CHARTED", 2)
+    monkeypatch.setattr(motion_examples, "SPREAD", 2)
+    monkeypatch.setattr(motion_examples, "CHARTED", 2)
     config = generators.Config(out=tmp_path / "o", variants=("gaussian", "flow"), seeds=(0, 1), flow_steps=2, **PEOPLE)
     generators.run(config)
     metrics = check(tmp_path / "o", "chosen", "validation", "real", "per_seed")

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from facejax import cli, fit_gpmm, fit_models, fit_motion, fit_residual, pipeline
+from facejax import cli, fit_gpmm, fit_models, fit_motion, fit_residual, motion_examples, pipeline
 
 PLANS = fit_models.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Plan(steps=2, batch=4))
 
@@ -55,7 +55,7 @@ def test_few_motions_make_a_small_chart(tiny_store, tmp_path, monkeypatch):
     def chart_of(known, *, labels, rank):
         raise Seen(len(known.start), labels, rank)
 
-    monkeypatch.setattr(fit_motion, "chart_of", chart_of)
+    monkeypatch.setattr(motion_examples, "chart_of", chart_of)
     named = {label: tiny_store.labels.index(label) for label in ("neutral", "anger", "high_smile")}
     few = tiny_store._replace(
         index=tiny_store.index | {"labels": list(named)},
@@ -64,10 +64,10 @@ def test_few_motions_make_a_small_chart(tiny_store, tmp_path, monkeypatch):
     with pytest.raises(Seen) as seen:
         fit_models.fit(few, tmp_path)
     motions, labels, rank = seen.value.args
-    assert labels == 3 and rank == motions // 4 < fit_models.RANK
+    assert labels == 3 and rank == motions // 4 < motion_examples.RANK
     with pytest.raises(Seen) as seen:
         fit_models.fit(tiny_store, tmp_path)
-    assert seen.value.args[2] == fit_models.RANK
+    assert seen.value.args[2] == motion_examples.RANK
 
 
 def test_what_cannot_be_learnt_from_is_named(tiny_store):

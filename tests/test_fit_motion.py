@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from facejax import augment, fit_motion, training
+from facejax import augment, fit_motion, motion_examples, training
 from facejax.data import motions, performance
 from facejax.models import charts, flow, generators, motion, motion_reference
 from tests.data.test_motions import recorded
@@ -28,17 +28,17 @@ def data():
 
 @pytest.fixture(scope="module")
 def known(data):
-    return fit_motion.transitions(data, "train", per_pair=6)
+    return motion_examples.transitions(data, "train", per_pair=6)
 
 
 @pytest.fixture(scope="module")
 def chart(known):
-    return fit_motion.chart_of(known, labels=4, rank=8, pose=4)
+    return motion_examples.chart_of(known, labels=4, rank=8, pose=4)
 
 
 @pytest.fixture(scope="module")
 def examples(known, chart):
-    return fit_motion.examples_of(chart, [known.take(np.arange(36)), known.take(np.arange(36, 72))])
+    return motion_examples.examples_of(chart, [known.take(np.arange(36)), known.take(np.arange(36, 72))])
 
 
 def test_examples_are_the_motions_in_the_chart(known, chart, examples):
@@ -59,18 +59,20 @@ def test_examples_are_the_motions_in_the_chart(known, chart, examples):
 
 def test_wrong_requests_are_named(known, chart, examples, tmp_path):
     with pytest.raises(ValueError, match="the highest label of the motions; got 2"):
-        fit_motion.chart_of(known, labels=2)
+        motion_examples.chart_of(known, labels=2)
     with pytest.raises(ValueError, match="1 step or more, got 0"):
         fit_motion.fit_flow(examples, chart, tmp_path / "none", plan=fit_motion.FlowPlan(steps=0))
     assert not (tmp_path / "none").exists()
-    for whole, parts in zip(fit_motion.examples_of(chart, known), fit_motion.examples_of(chart, [known]), strict=True):
+    for whole, parts in zip(
+        motion_examples.examples_of(chart, known), motion_examples.examples_of(chart, [known]), strict=True
+    ):
         np.testing.assert_array_equal(whole, parts)
 
 
 def test_the_papers_set_has_the_papers_size():
     """12 people, 12 expressions: 288 halves, 48 of each of 132 ordered pairs: about 6,740; one of each held out."""
     data = recorded(subjects=12, labels=("neutral", *performance.COMA))
-    found = fit_motion.transitions(data, "train", per_pair=fit_motion.PER_PAIR, reuse=None)
+    found = motion_examples.transitions(data, "train", per_pair=motion_examples.PER_PAIR, reuse=None)
     assert len(found.start) == 288 + 132 * 48 == 6624
     pairs = np.bincount(found.start * 13 + found.end, minlength=169).reshape(13, 13)
     expected = np.where(np.eye(13), 0, 48)
@@ -83,7 +85,7 @@ def test_coma_labels_are_13():
     """Of a dataset with more expressions than CoMA has; numbers follow the names given, not the dataset."""
     data = recorded(subjects=2, labels=("neutral", *performance.EXPRESSIONS[::-1]))
     names = ("neutral", *performance.COMA)
-    found = motions.join(*fit_motion.everything(data, "train", names=names, per_pair=1))
+    found = motions.join(*motion_examples.everything(data, "train", names=names, per_pair=1))
     assert len(found.start) == 2 * 12 * 2 + 132
     assert {*found.start.tolist()} == {*found.end.tolist()} == {*range(13)}
     first = next(one for one in data.sequences if one.label == "bareteeth" and one.subject == 1)
@@ -94,7 +96,7 @@ def test_coma_labels_are_13():
 
 
 def test_everything_lets_everybody_meet_everybody(data):
-    parts = [*fit_motion.everything(data, "train", per_pair=None)]
+    parts = [*motion_examples.everything(data, "train", per_pair=None)]
     assert [len(part.start) for part in parts] == [36, 6 * 36]
     counts = np.bincount(parts[1].subject, minlength=6)
     assert counts.tolist() == [36] * 6
@@ -102,16 +104,16 @@ def test_everything_lets_everybody_meet_everybody(data):
 
 def test_balanced_rows_hold_every_pair_equally_often():
     start, end = np.array([0, 0, 0, 1, 1, 2]), np.array([1, 1, 1, 0, 0, 1])
-    rows = fit_motion.balanced(start, end)
+    rows = motion_examples.balanced(start, end)
     pairs = list(zip(start[rows].tolist(), end[rows].tolist(), strict=True))
     assert {pair: pairs.count(pair) for pair in set(pairs)} == {(0, 1): 3, (1, 0): 3, (2, 1): 3}
     assert set(rows.tolist()) == set(range(6))
-    np.testing.assert_array_equal(fit_motion.balanced(start, end), rows)
-    assert len({fit_motion.balanced(start, end, seed).tobytes() for seed in range(9)}) > 1
+    np.testing.assert_array_equal(motion_examples.balanced(start, end), rows)
+    assert len({motion_examples.balanced(start, end, seed).tobytes() for seed in range(9)}) > 1
 
 
 def test_extrinsic_mean_is_near_the_karcher_mean(known, chart):
-    other = fit_motion.chart_of(known, labels=4, rank=8, pose=4, mean="extrinsic")
+    other = motion_examples.chart_of(known, labels=4, rank=8, pose=4, mean="extrinsic")
     cosine = float(np.sum(np.asarray(chart.p) * np.asarray(other.p))) / 29
     assert 0.5 < cosine < 1 - 1e-6
     # Of the two, the Karcher mean is the one about which the motions are centred.
@@ -119,7 +121,7 @@ def test_extrinsic_mean_is_near_the_karcher_mean(known, chart):
         known.start * 4 + known.end, minlength=16))) for one in (chart, other)]  # fmt: skip
     assert off[0] < 1e-3 < off[1]
     with pytest.raises(ValueError, match="mean: expected"):
-        fit_motion.chart_of(known, labels=4, mean="median")
+        motion_examples.chart_of(known, labels=4, mean="median")
 
 
 def check(params, kind):
@@ -211,7 +213,7 @@ def test_the_authors_gan_trains(known, chart, tmp_path):
 
 
 def test_starts_are_fitted_on_the_peaks(known, chart):
-    found = fit_motion.fit_starts(chart, known)
+    found = motion_examples.fit_starts(chart, known)
     assert found.poses.shape == (4, 6, 4) and found.count.tolist() == [1, 6, 6, 6]
     peaks = known.take((known.start == 0) & (known.end == 2)).curves[:, -1]
     basis = np.asarray(chart.pose_basis, np.float64).reshape(4, -1)

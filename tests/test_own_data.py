@@ -21,7 +21,7 @@ from experiments import (
     table2,
     unseen_subjects,
 )
-from facejax import fit_models, fit_motion, pipeline
+from facejax import fit_motion, motion_examples, pipeline
 from facejax.data import makehuman4d, motions, store
 from tests.test_dense_experiments import tiny  # noqa: F401 (a fixture)
 from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
@@ -69,11 +69,11 @@ def own(tmp_path_factory):
 def model(own, tmp_path_factory):
     """Its motion, and the released way to meshes: the triangles are MakeHuman's."""
     data, path = store.open_store(own), tmp_path_factory.mktemp("model") / "own.safetensors"
-    known = motions.join(*fit_motion.everything(data, "train", per_pair=8))
-    chart = fit_motion.chart_of(known, labels=len(LABELS), rank=fit_models.rank_of(known))
-    examples = fit_motion.examples_of(chart, known)
+    known = motions.join(*motion_examples.everything(data, "train", per_pair=8))
+    chart = motion_examples.chart_of(known, labels=len(LABELS), rank=motion_examples.rank_of(known))
+    examples = motion_examples.examples_of(chart, known)
     motion = fit_motion.fit_flow(examples, chart, path.with_suffix(""), plan=fit_motion.FlowPlan(steps=2, batch=8))
-    starts = fit_motion.fit_starts(chart, motions.halves(data, "train"))
+    starts = motion_examples.fit_starts(chart, motions.halves(data, "train"))
     pipeline.save(path, pipeline.load()._replace(labels=LABELS, motion=motion, starts=starts))
     return path
 
@@ -91,8 +91,8 @@ def test_generated_motion(own_cache, own, model, experiment, tmp_path):  # noqa:
 
 
 def test_generators_are_chosen(own_cache, own, model, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(fit_motion, "SPREAD", 3)
-    monkeypatch.setattr(fit_motion, "CHARTED", 8)
+    monkeypatch.setattr(motion_examples, "SPREAD", 3)
+    monkeypatch.setattr(motion_examples, "CHARTED", 8)
     options = {"variants": ("gaussian", "flow"), "seeds": (0,), "flow_steps": 2}
     with pytest.raises(ValueError, match="the released models: expected the labels"):
         generators.run(generators.Config(out=tmp_path / "o", data=own, **options))
