@@ -5,8 +5,8 @@
 Two MakeHuman populations: *A* is makehuman4d's own (seed 1, as made); *B* has other people with other ways to perform
 (seed 2) and what registering scans leaves behind, 0.2 mm of smooth noise, new in every frame. As in OT23, one
 direction is judged on all of B, the other on the test set of A. Noise in the truth is nobody's to predict: how far it
-alone moves vertices has a row, and B is judged against its noise-free meshes as well ("B, clean"). With `--first` and `--second`, two stores of the user's
-own, CoMA and Florence 4D say, in one topology.
+alone moves vertices has a row, and B is judged against its noise-free meshes as well ("B, clean"). With `--first` and
+`--second`, two stores of the user's own, CoMA and Florence 4D say, in one topology.
 
 `--quick` is a look; `--paper` trains for 300 epochs. A stopped run goes on.
 """
@@ -142,7 +142,10 @@ def _plot(path: Path, rows, titles, methods) -> Path:
         )
     axis.set_xticks(range(len(titles)), titles)
     axis.set_ylabel("mean vertex error of the face, mm")
-    axis.legend(frameon=False, fontsize=8)
+    alone = _value(rows, titles[0], ALONE, "face")
+    if not np.isnan(alone):
+        axis.plot([-0.45, 0.45], [alone, alone], "k--", linewidth=1, label=ALONE)
+    figure.legend(frameon=False, fontsize=8, loc="outside right center")
     return _dense.drawn(figure, path)
 
 
