@@ -25,6 +25,7 @@ NAMES = {
     "s2d": "S2D-Dec",
     "s2d_residual": "residual decoder",
     "gpmm": "carried GPMM (its base)",
+    "gpmm_found": "GPMM, noise found",
     "ridge": "ridge",
     "pca38": "PCA-38",
     "pca220": "PCA-220",
@@ -141,7 +142,7 @@ def fitted(name: str, case: Case, folder: Path, options: methods.Options) -> Any
 def _fit(name: str, case: Case, folder: Path, options: methods.Options) -> tuple[Any, float]:
     """Parameters, and the seconds that they took; of networks those of their steps, however often they were stopped."""
     begun = time.perf_counter()
-    if name in ("gpmm", "s2d_residual"):
+    if name in ("gpmm", "gpmm_found", "s2d_residual"):
         options = options._replace(base=base(case, options))
     model = methods.METHODS[name].fit(case.train, folder, options)
     steps = [entry["seconds"] for entry in journal.read(folder)]
@@ -163,7 +164,7 @@ def base(case: Case, options: methods.Options):
 def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
     if isinstance(model, methods.LinearFit):
         return {"alpha_mm2": model.alpha}
-    if name == "gpmm":
+    if name in ("gpmm", "gpmm_found"):
         return model.params.prior._asdict()
     if name == "s2d_residual":
         return {**model.base.prior._asdict(), "gate": float(model.network.gate), "steps": options.residual.steps}
@@ -174,7 +175,7 @@ def key(name: str, case: Case, options: methods.Options, noises: Sequence[float]
     """What a kept result depends on, as a hash."""
     plans = {
         "s2d": [options.decoder], "neural3dmm": [options.neural3dmm], "gpmm": [options.components],
-        "s2d_residual": [options.residual, options.components],
+        "gpmm_found": [options.components], "s2d_residual": [options.residual, options.components],
     }.get(name, [])  # fmt: skip
     facts = [name, plans, options.by, options.seed, dict(case.train.data.index["spec"]), sorted(noises)]
     digest = hashlib.sha256(repr(facts).encode())

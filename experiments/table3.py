@@ -29,7 +29,7 @@ from facejax.data.meshes import Meshes, of_split
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "gpmm", "s2d_residual", "s2d")
+METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "gpmm", "gpmm_found", "s2d_residual", "s2d")
 NOISE = 0.2  # mm, of B
 ALONE = "B's noise alone"
 SEEDS = (1, 2)

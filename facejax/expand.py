@@ -37,13 +37,14 @@ class Params(NamedTuple):
 
 
 def apply(
-    params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True, noise: float = 0.0
+    params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True, noise: float | None = 0.0
 ) -> jax.Array:
     """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
 
     Without `refined` the linear answer alone, which is one product of matrices. `noise` tells by how many mm the
-    landmarks are off in every coordinate, such as those of a detector: the linear answer takes it into account, and
-    goes unrefined, since the network has learnt from landmarks that are right.
+    landmarks are off in every coordinate, such as those of a detector; None finds it out from the frames given
+    (`gpmm.noise_of`). The linear answer takes it into account, and goes unrefined, since the network has learnt from
+    landmarks that are right.
 
     Raises `ValueError` for other shapes, and for a face that is traced: each is prepared on the host.
     """
@@ -51,7 +52,11 @@ def apply(
         raise ValueError(
             "neutral: every face is prepared on the host, so that it cannot be traced: leave it out of jit"
         )
-    base = linear.apply(on_face(params.base, np.asarray(neutral), noise), jnp.asarray(displacements))
+    neutral = np.asarray(neutral)
+    if noise is None:
+        marks = np.asarray(displacements)
+        noise = gpmm.noise_of(params.base, neutral, marks.reshape(-1, *marks.shape[-2:]))
+    base = linear.apply(on_face(params.base, neutral, noise), jnp.asarray(displacements))
     if noise or not refined:
         return base
     lead = base.shape[:-2]

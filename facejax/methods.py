@@ -141,6 +141,11 @@ def _apply_gpmm(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.
     return neutral + np.asarray(linear.apply(gpmm.on_face(fitted.params, neutral), displacements))
 
 
+def _apply_doubting(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    params = gpmm.told(fitted.params, gpmm.noise_of(fitted.params, neutral, displacements))
+    return neutral + np.asarray(linear.apply(gpmm.on_face(params, neutral), displacements))
+
+
 def _fit_residual(train: Meshes, folder: Path, options: Options) -> expand.Params:
     return fit_residual.fit(
         train, _hierarchy(train, options), folder, plan=options.residual, by=options.by, seed=options.seed,
@@ -179,6 +184,7 @@ METHODS = {
     "s2d": Method(_fit_s2d, _apply_s2d),
     "s2d_residual": Method(_fit_residual, _apply_residual),
     "gpmm": Method(_fit_gpmm, _apply_gpmm),
+    "gpmm_found": Method(_fit_gpmm, _apply_doubting),
     "ridge": _linear(linear.ridge),
     "pca38": _linear(linear.pca, components=38),
     "pca220": _linear(linear.pca, components=220),

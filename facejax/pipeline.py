@@ -155,12 +155,12 @@ def meshes(
     neutral: np.ndarray | jax.Array,
     *,
     refined: bool = True,
-    noise: float = 0.0,
+    noise: float | None = 0.0,
 ) -> jax.Array:
     """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3).
 
     Without `refined` the linear answer alone, much faster and little worse; `noise` tells by how many mm landmarks are
-    off, such as those of a detector. Both as in `expand.apply`; S2D-Dec knows neither, and refuses `noise`.
+    off, such as those of a detector; None finds it out. Both as in `expand.apply`; S2D-Dec refuses `noise`.
     """
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
@@ -169,7 +169,7 @@ def meshes(
         return jnp.asarray(neutral, jnp.float32) + expand.apply(
             models.decoder, landmarks - rest, neutral, refined=refined, noise=noise
         )
-    if noise:
+    if noise != 0:
         raise ValueError("noise: S2D-Dec cannot be told of it; the best linear answer can (`facejax.expand`)")
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 

@@ -91,6 +91,12 @@ def test_told_of_noise_it_trusts_landmarks_less(params, person):
     assert errors[1] < 0.8 * errors[0]
     trusting = expand.apply(params, marks, neutral, noise=1e-6)
     np.testing.assert_allclose(trusting, expand.apply(params, marks, neutral, refined=False), atol=1e-4)
+    # What it finds out by itself is as good, and harms landmarks that are right little.
+    found = np.asarray(expand.apply(params, noisy, neutral, noise=None))
+    assert np.linalg.norm(found - moved, axis=-1).mean() < 1.1 * errors[1]
+    right = [np.linalg.norm(np.asarray(expand.apply(params, marks, neutral, **options)) - moved, axis=-1).mean()
+             for options in ({"noise": None}, {"refined": False})]  # fmt: skip
+    assert right[0] < 1.2 * right[1]
     with pytest.raises(ValueError, match="noise: expected 0 mm or more, got -1"):
         expand.apply(params, marks, neutral, noise=-1)
     with pytest.raises(ValueError, match="kept as one map"):

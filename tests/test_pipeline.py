@@ -67,6 +67,8 @@ def test_meshes_unrefined_and_of_a_detectors_landmarks(models, person):
     right, plain = error(true[:, at]), error(true[:, at], refined=False)
     assert right < plain < 1.5 * right and plain < 0.05
     assert error(noisy, noise=0.5) < 0.3 * error(noisy)
+    assert error(noisy, noise=None) < 1.05 * error(noisy, noise=0.5)
+    assert error(true[:, at], noise=None) < 1.05 * plain
 
 
 def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):

@@ -5,6 +5,7 @@ faces showed and of a smooth prior (Luthi et al. 2018), which takes up what they
 as far as it usually moves. The most probable displacement given the landmarks', with noise of variance `noise`, is one
 affine map; it differs from face to face where the covariance was learnt on a mean face and is *carried* to the given
 one by deformation transfer (`facejax.mesh.transfer`). Plain, and without the smooth prior, it is ridge regression.
+Landmarks that are off, a detector's say, mislead it badly; it can be `told` how far, or find out (`noise_of`).
 
     params = gpmm.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
     mine = gpmm.on_face(params, neutral)  # once per face, half a second
@@ -28,6 +29,7 @@ from facejax.models import linear
 
 COMPONENTS = 400
 SCALES = (10.0, 20.0, 40.0, 80.0)  # mm, of the smooth prior: wrinkles of a cheek, a cheek, a jaw, a head
+DOUBTS = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # mm, of landmarks: a sixteenth from one to the next
 
 
 class Person(NamedTuple):
@@ -115,6 +117,24 @@ def told(params: Params, noise: float) -> Params:
     if noise and isinstance(params.statistics, linear.Params):
         raise ValueError("noise: this model was kept as one map, which was made for landmarks that are right")
     return params._replace(prior=params.prior._replace(noise=params.prior.noise + noise**2))
+
+
+def noise_of(params: Params, neutral: np.ndarray, landmarks: np.ndarray) -> float:
+    """How far landmark displacements (T, L, 3) of one face (N, 3) are off, by the model: mm in every coordinate.
+
+    The noise under which they are most likely (type II maximum likelihood): what no face does is noise. One number for
+    all frames. Raises `ValueError` as `on_face` and `told` do.
+    """
+    if isinstance(params.statistics, linear.Params):
+        raise ValueError("noise: this model was kept as one map, which cannot tell what faces do not do")
+    known = covariances(params, neutral, only=np.zeros(0, int))
+    here, _ = _posterior(known, params.prior)
+    variance, directions = np.linalg.eigh(here)
+    off = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
+    seen = np.mean(np.square(off @ directions), axis=0)
+    whole = np.maximum(variance, params.prior.noise) + np.square(DOUBTS)[:, None]
+    likelihood = -np.sum(np.log(whole) + seen / whole, axis=1)
+    return float(DOUBTS[np.argmax(likelihood)])
 
 
 def on_face(params: Params, neutral: np.ndarray) -> linear.Params:

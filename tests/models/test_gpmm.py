@@ -158,3 +158,20 @@ def test_wrong_input_is_named(people):
         fit([], False, 0.0, 1e-2)
     with pytest.raises(ValueError, match="at least one person with a frame"):
         fit([person(0, frames=0)], True, 0.0, 1e-2)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3, 1.5])
+def test_noise_of_landmarks_is_found(noise):
+    """Faces that move in few ways; what is none of them is noise."""
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    rest, faces = 50 * np.asarray(ball.vertices), np.asarray(ball.faces, np.int32)
+    at = rng.permutation(len(rest))[:30].astype(np.int32)
+    shapes = rng.normal(size=(4, *rest.shape))
+    moved = np.einsum("fk,knx->fnx", rng.normal(size=(200, 4)), shapes)
+    prior = gpmm.Prior(carried=False, smooth=0.0, noise=1e-8)
+    params = gpmm.fit([gpmm.Person(rest, moved[:100, at], moved[:100])], faces, at, prior=prior)
+    marks = moved[100:, at] + noise * rng.standard_normal((100, 30, 3))
+    assert gpmm.noise_of(params, rest, marks) == pytest.approx(noise, rel=0.05, abs=0.01)
+    # One frame tells as well, less surely.
+    assert gpmm.noise_of(params, rest, marks[:1]) == pytest.approx(noise, rel=0.4, abs=0.01)
