@@ -33,7 +33,7 @@ from facejax.data.meshes import of_split
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "gpmm", "s2d_residual", "s2d", "neural3dmm")
+METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "gpmm", "gpmm_found", "s2d_residual", "s2d", "neural3dmm")
 WINDOW = 20  # frames
 LEVEL = 3  # realism of what is learnt from
 PAPER = {"pca220": 2.90, "dl3dmm": 2.73, "neural3dmm": 3.49, "s2d": 1.48}  # OT23, Table 2, VOCASET, mm
@@ -154,7 +154,7 @@ def _plot(path: Path, rows, methods_) -> Path:
         axis.bar(np.arange(len(methods_)) + 0.4 * i - 0.2, values, 0.4, label=label)
     axis.set_xticks(range(len(methods_)), [_dense.NAMES[name] for name in methods_], rotation=20, ha="right")
     axis.set_ylabel("mean vertex error of the face, mm")
-    axis.legend(frameon=False)
+    figure.legend(frameon=False, loc="outside right center")
     return _dense.drawn(figure, path)
 
 

@@ -101,7 +101,7 @@ def _plot(path: Path, rows) -> Path:
     axis.set_yticks(np.arange(len(VARIANTS)) + 0.2, list(VARIANTS))
     axis.invert_yaxis()
     axis.set_xlabel("mean vertex error, mm")
-    axis.legend(frameon=False)
+    figure.legend(frameon=False, loc="outside right center")
     return _dense.drawn(figure, path)
 
 
