@@ -43,6 +43,14 @@ def data_of(
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
 
+def check_alike(a: store.Store, b: store.Store) -> None:
+    """Raise `ValueError` for two datasets of other triangles or landmarks."""
+    for name in ("faces", "landmark_index"):
+        if not np.array_equal(getattr(a, name), getattr(b, name)):
+            what = "triangles" if name == "faces" else "landmarks"
+            raise ValueError(f"{a.path} and {b.path} have other {what}: both have to be in one topology")
+
+
 def is_makehuman(data: store.Store) -> bool:
     """Whether the store holds the embedded dataset."""
     return data.index.get("name") == "makehuman4d"

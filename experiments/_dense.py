@@ -60,8 +60,10 @@ class Options:
         return "quick" if self.quick else "paper" if self.paper else "default"
 
     def folder(self, out: Path | None = None) -> Path:
-        """Where checkpoints lie: a look and the real thing do not go on from one another."""
+        """Where checkpoints lie: a look and the real thing, or two datasets, do not go on from one another."""
         out = self.out if out is None else out
+        if (data := getattr(self, "data", None)) is not None:
+            out = out / f"{data.name}-{hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:8]}"
         return out if self.mode == "default" else out / self.mode
 
 

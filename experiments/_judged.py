@@ -46,15 +46,15 @@ class People:
     """Options of an experiment on these groups."""
 
     data: Path | None = None
-    """A prepared dataset in place of makehuman4d."""
+    """A prepared dataset (`facejax data prepare`) in place of makehuman4d; give models of it, too (`facejax fit`)."""
     level: int = 3
-    """Realism of the dataset."""
+    """Realism of makehuman4d."""
     subjects: int = 120
-    """Of the dataset."""
+    """Of makehuman4d."""
     meshes: int = 20_000
-    """Of the dataset."""
+    """Of makehuman4d."""
     people: int = 120
-    """Of the population that joins the validation or the test subjects; 0: none."""
+    """Of the population that joins makehuman4d's validation or test subjects; 0: none."""
     publish: bool = False
     """Also write the figures that the README quotes."""
 
@@ -68,7 +68,7 @@ class Options(People):
     models: tuple[Path, ...] = ()
     """Weights to judge, the mean over them; by default the released ones, which know makehuman4d alone."""
     samples: int = 64
-    """Generated motions of each pair; of chains, each sequence."""
+    """Generated motions of each pair, or of each chain."""
 
 
 def models_of(config: Options) -> list[pipeline.Models]:
@@ -80,13 +80,17 @@ def models_of(config: Options) -> list[pipeline.Models]:
 
 
 def fits(models: pipeline.Models, data: store.Store, path: Path | str) -> None:
-    """Raise `ValueError` for models that were made for other labels or landmarks than the dataset's."""
-    known = models.labels, len(models.face.landmark_index)
-    wanted = data.labels, len(data.landmark_index)
-    if known != wanted:
+    """Raise `ValueError` for models that were made for other labels, triangles or landmarks than the dataset's."""
+    mesh = models.face
+    if models.labels != data.labels:
         raise ValueError(
-            f"{path}: expected the labels of {data.path}, {', '.join(data.labels)}, and its {wanted[1]} landmarks; got "
-            f"{', '.join(models.labels)}, and {known[1]}: `facejax fit --data` makes models of a dataset"
+            f"{path}: expected the labels of {data.path}, {', '.join(data.labels)}; got {', '.join(models.labels)}: "
+            "`facejax fit --data` makes models of a dataset"
+        )
+    if not (np.array_equal(mesh.faces, data.faces) and np.array_equal(mesh.landmark_index, data.landmark_index)):
+        raise ValueError(
+            f"{path}: expected the triangles and landmarks of {data.path}: "
+            "`facejax fit --data` makes models of a dataset"
         )
 
 
@@ -106,11 +110,14 @@ def names_of(data: store.Store) -> tuple[Names, ...]:
 
 def halves_of(config: People, group: str) -> motions.Motions:
     """Every half of a group's people."""
-    parts = [motions.halves(data_of(config), group)]
+    data = data_of(config)
+    if not len(data.subjects(group)):
+        raise ValueError(f"{data.path}: nobody is in the {group} split")
+    parts = [motions.halves(data, group)]
     if config.people and config.data is None:
         spec = makehuman4d.Spec(config.level, config.people, config.people, seed=GROUPS[group])
         others = makehuman4d.prepare(spec)
-        for split in ("train", "validation", "test"):
+        for split in (split for split in store.SPLITS if len(others.subjects(split))):
             part = motions.halves(others, split)
             parts.append(part._replace(subject=part.subject + config.subjects))
     return motions.join(*parts)
@@ -119,14 +126,15 @@ def halves_of(config: People, group: str) -> motions.Motions:
 def held(config: People, group: str, names: Sequence[Names]) -> Held:
     """Unselected transitions of a group's people: as many of each pair as there are people.
 
-    Raises `ValueError` for fewer than four people: one half of them is compared with the other.
+    Raises `ValueError` for fewer than four people or motions of a pair: one half is compared with the other.
     """
-    labels = data_of(config).labels
+    data = data_of(config)
+    labels = data.labels
     halves = halves_of(config, group)
     pairs = [(labels.index(a), labels.index(b)) for a, b in names]
     people = len(np.unique(halves.subject))
     if people < FEWEST:
-        raise ValueError(f"{config.data}: expected {FEWEST} or more people in the {group} split, got {people}")
+        raise ValueError(f"{data.path}: expected {FEWEST} or more people in the {group} split, got {people}")
     onsets = halves.take(halves.start == 0)
     between = motions.interpolated(onsets, len(labels), per_pair=people, choice="spread", only=set(pairs), seed=1)
     found = motions.join(halves, *between)
@@ -134,7 +142,7 @@ def held(config: People, group: str, names: Sequence[Names]) -> Held:
     curves = [scale * of_pair(found, pair) for pair in pairs]
     few = [" > ".join(name) for name, each in zip(names, curves, strict=True) if len(each) < FEWEST]
     if few:
-        raise ValueError(f"{config.data}: expected {FEWEST} or more motions of every pair, not so of {', '.join(few)}")
+        raise ValueError(f"{data.path}: expected {FEWEST} or more motions of every pair, not so of {', '.join(few)}")
     seconds = [found.seconds[(found.start == a) & (found.end == b)] for a, b in pairs]
     # Of the half that stands for "real", so that it is never compared with itself.
     halves = [np.zeros(len(c) // 2, int) for c in curves]

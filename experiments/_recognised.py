@@ -13,7 +13,7 @@ from facejax.data import motions
 
 
 def forest(config: _judged.People, names: Sequence[_judged.Names], trees: int = 300) -> RandomForestClassifier:
-    """OT23's classifier: 30 x 204 displacements from neutral, unitless, of training people's transitions -> which pair.
+    """OT23's classifier: 30 x 3 L displacements from neutral, unitless, of training people's transitions -> which pair.
 
     Its training set is the one of OT23: halves, and transitions selected by prototypes.
     """

@@ -38,11 +38,19 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
     config = tyro.cli(config_type, prog=f"python -m experiments.{name}", description=description)
     results.compile_cache()
     try:
+        _check_publish(config)
         run(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"experiments.{name}: {error}", file=sys.stderr)
+        print(f"experiments.{name}: {' '.join(str(error).split())}", file=sys.stderr)
         raise SystemExit(2) from error
     print(f"results in {config.out}")
+
+
+def _check_publish(config: Any) -> None:
+    """What the README quotes is of the full experiment on the embedded data."""
+    given = [name for name in ("data", "first", "second", "speech", "quick") if getattr(config, name, None)]
+    if getattr(config, "publish", False) and given:
+        raise ValueError(f"--publish writes what the README quotes: leave out --{', --'.join(given)}")
 
 
 def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None) -> dict[str, Any]:

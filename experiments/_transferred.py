@@ -35,7 +35,7 @@ def of_skin(skin: np.ndarray, person: makehuman.Subject, index: np.ndarray) -> T
 
 
 def stored(data: store.Store, subject: int, label: str) -> Take | None:
-    """The first recording of a subject under a label in a dataset that has meshes; None where there is none."""
+    """A subject's first recording under a label of which there are meshes; None where there is none."""
     for sequence in data.sequences:
         if (sequence.subject, sequence.label) == (subject, label):
             take = of_sequence(data, sequence)
@@ -73,11 +73,12 @@ def onto(source: Take, target: Take, index: np.ndarray) -> np.ndarray:
 def errors(made: np.ndarray, target: Take, mask: np.ndarray, window: int) -> np.ndarray:
     """(2, M): the mean distance of a mask's vertices (N,) in every frame whose mesh is known, of meshes (T, N, 3).
 
-    Frame by frame, and the least of that within a window of so many frames about it.
+    Frame by frame, and the least of that within half a window of frames before and after.
     """
+    half = window // 2
     found = np.full((2, len(target.at)), np.inf)
     made, true = made[:, mask], target.vertices[:, mask]
-    for shift in range(-window // 2, window // 2 + 1):
+    for shift in range(-half, half + 1):
         inside = np.flatnonzero((target.at + shift >= 0) & (target.at + shift < len(made)))
         apart = np.linalg.norm(made[target.at[inside] + shift] - true[inside], axis=-1).mean(axis=1)
         found[1, inside] = np.minimum(found[1, inside], apart)

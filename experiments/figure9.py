@@ -13,6 +13,7 @@ its labels, and the first label that all three have recordings of. The films lie
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,8 @@ class Config:
     """A prepared dataset, of which `--model` was made, in place of MakeHuman's people."""
     people: tuple[int, ...] = ()
     """Numbers of the chains' two people, who are also the targets, and the source; by default 103, 108 and 114, of
-    MakeHuman's test subjects (100 to 119), or three whom the dataset holds out."""
+    MakeHuman's test subjects (100 to 119), or the first three of the
+    dataset's test, validation and training people."""
     recording: Path | None = None
     """A recording of Live Link Face (CSV)."""
     begin: float = 60.0
@@ -61,9 +63,11 @@ class Config:
 
 def run(config: Config) -> dict[str, Any]:
     """The sheet, the films, and how far the transferred motion is from how the target itself moves."""
+    if config.data is not None and config.recording is not None:
+        raise ValueError("--recording moves MakeHuman's people, and --data brings its own: name one of them")
     begun, models = time.perf_counter(), pipeline.load(config.model)
     index = np.asarray(models.face.landmark_index)
-    chains, takes = _stored(config, models) if config.data else (CHAINS, _performed(config, index))
+    chains, takes = _stored(config, models) if config.data else (CHAINS, _performed(config, models))
     labels, films = [], {}
     for i, (chain, take) in enumerate(zip(chains, takes, strict=False)):
         key = jax.random.fold_in(jax.random.key(config.seed), i)
@@ -71,7 +75,11 @@ def run(config: Config) -> dict[str, Any]:
         films[f"chain{i + 1}"] = take, np.asarray(pipeline.meshes(models, marks, take.rest)), marks
         labels.append(", ".join(chain[1:-1]))
     *targets, source = takes
-    films["source"] = source, source.vertices, source.vertices[:, index]
+    marks = source.rest[index] + source.landmarks
+    if len(source.at) == len(marks):
+        films["source"] = source, source.vertices, marks
+    else:  # not every frame has a mesh
+        films["source"] = source, np.asarray(pipeline.meshes(models, marks, source.rest)), marks
     labels.append("source")
     errors, everywhere = [], np.ones(len(source.rest), bool)
     for i, take in enumerate(targets):
@@ -99,9 +107,14 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _performed(config: Config, index: np.ndarray) -> list[_transferred.Take]:
+def _performed(config: Config, models: pipeline.Models) -> list[_transferred.Take]:
     """Three of MakeHuman's people under the recording, or as the third of them performs."""
+    index = np.asarray(models.face.landmark_index)
     numbers = config.people or PEOPLE
+    template, known = makehuman.template(), set(itertools.chain(*CHAINS))
+    same = np.array_equal(template.faces, models.face.faces) and np.array_equal(template.landmarks, index)
+    if not same or not known <= set(models.labels):
+        raise ValueError(f"{config.model}: was made of another dataset than makehuman4d: name it with --data")
     if len(numbers) != 3:
         raise ValueError(f"--people: expected three numbers, got {config.people}")
     people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]

@@ -5,10 +5,10 @@
 
 A recording of Live Link Face drives one unseen person; the motion of its landmarks is encoded as an SRVF, put on
 other people's neutral landmarks, scaled to their size, and expanded to their meshes. The truth is how the same
-recording moves those people's own rigs. Fitted to makehuman4d's training people and CoMA's twelve expressions: no
-speech among them. Five passages of the recording. OT23 takes each frame's least error within a window of 20 frames,
-which flatters; the error frame by frame stands beside it. What the transfer itself costs is told by the methods'
-errors from the person's own landmarks.
+recording moves those people's own rigs. Fitted to makehuman4d's training and validation people in CoMA's twelve
+expressions: no speech among them. Five passages of the recording. OT23 takes each frame's least error within a window
+of 20 frames (here ten before and ten after), which flatters; the error frame by frame stands beside it. What the
+transfer itself costs is told by the methods' errors from the person's own landmarks.
 
 With `--speech`, a dataset in the topology of `--data`, sentences are its labels: the source says one, and what others
 say under the same label is the truth, stretched to one length; VOCASET, for one. `--quick` is a look; `--paper` trains
@@ -50,7 +50,7 @@ class Config(_dense.Options):
     speech: Path | None = None
     """In place of a recording: a prepared dataset whose recordings are carried from person to person."""
     people: int = 11
-    """To how many people the motion is carried."""
+    """To how many people the motion is carried, at most."""
     passages: int = 5
     """How many parts of the recording, spread over it; or how many labels."""
     seconds: float = 4.0
@@ -63,6 +63,8 @@ def run(config: Config) -> dict[str, Any]:
     """One row per method and region."""
     if (config.recording is None) == (config.speech is None):
         raise ValueError("expected --recording with a recording of Live Link Face, or --speech with a prepared dataset")
+    if config.people < 1 or config.passages < 1:
+        raise ValueError(f"expected --people and --passages of 1 or more, got {config.people} and {config.passages}")
     mode = config.mode
     _dense.check_methods(config.methods)
     data = _cases.data_of(config.data, mode, level=LEVEL)
@@ -102,9 +104,13 @@ def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.
     if not _cases.is_makehuman(data):
         raise ValueError(f"--recording moves people of makehuman4d, and {config.data} has others: use --speech")
     source, *others = data.subjects("test").tolist()
-    if not 1 <= config.people <= len(others):
-        raise ValueError(f"--people: expected 1 to {len(others)} besides the source, got {config.people}")
+    if not others:
+        raise ValueError(f"{data.path}: expected two or more test subjects, got 1")
     length = float(livelink.read(config.recording).times[-1])
+    if not 0.8 * length >= config.seconds > 0:
+        raise ValueError(
+            f"--seconds: expected at most 0.8 of the {length:.1f} s of the recording, got {config.seconds:g}"
+        )
     begins = np.linspace(0.1 * length, 0.9 * length - config.seconds, config.passages)
     takes = [drive.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
     faces = {i: makehuman.subject(i, seed=data.index["spec"]["seed"]) for i in (source, *others[: config.people])}
@@ -116,11 +122,14 @@ def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.
 def _of_dataset(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
     talk = store.open_store(config.speech)
-    if not np.array_equal(talk.faces, data.faces):
-        raise ValueError(f"{talk.path} and {data.path} have other triangles: both have to be in one topology")
+    _cases.check_alike(talk, data)
     people = talk.subjects("test") if len(talk.subjects("test")) > 1 else np.arange(len(talk.neutral))
-    source, *others = people[: config.people + 1].tolist()
-    labels = [label for label in talk.labels[1:] if _transferred.stored(talk, source, label)][: config.passages]
+    named = talk.labels[1:]
+    speakers = [who for who in people.tolist() if any(_transferred.stored(talk, who, label) for label in named)]
+    if len(speakers) < 2:
+        raise ValueError(f"{talk.path}: expected two or more people with recordings that have meshes")
+    source, *others = speakers[: config.people + 1]
+    labels = [label for label in named if _transferred.stored(talk, source, label)][: config.passages]
     pairs = [
         (_transferred.stored(talk, source, label), target)
         for label in labels
@@ -128,7 +137,7 @@ def _of_dataset(config: Config, data: store.Store) -> list[tuple[_transferred.Ta
         if (target := _transferred.stored(talk, other, label)) is not None
     ]
     if not pairs:
-        raise ValueError(f"{talk.path}: expected two or more people with recordings of one label, and meshes of them")
+        raise ValueError(f"{talk.path}: expected two or more people with recordings of one label that have meshes")
     return pairs
 
 

@@ -47,9 +47,9 @@ class Config(_dense.Options):
     out: Path = Path("runs/table3")
     """Folder for checkpoints and results."""
     first: Path | None = None
-    """A prepared dataset in place of A."""
+    """A prepared dataset in place of A; in one topology with B."""
     second: Path | None = None
-    """A prepared dataset in place of B."""
+    """A prepared dataset in place of B; in one topology with A."""
     methods: tuple[str, ...] = METHODS
     """Which methods."""
 
@@ -60,8 +60,7 @@ def run(config: Config) -> dict[str, Any]:
     _dense.check_methods(config.methods)
     a = _cases.data_of(config.first, mode, level=LEVEL, seed=SEEDS[0])
     b = _cases.data_of(config.second, mode, level=LEVEL, seed=SEEDS[1], noise=NOISE)
-    if not np.array_equal(a.faces, b.faces):
-        raise ValueError(f"{a.path} and {b.path} have other triangles: both have to be in one topology")
+    _cases.check_alike(a, b)
     regions, hierarchy = _cases.regions_of(a), _cases.hierarchy_of(a)
     directions = [("A to B", a, _everybody(b)), ("B to A", b, of_split(a, "test"))]
     if config.second is None:
@@ -76,7 +75,7 @@ def run(config: Config) -> dict[str, Any]:
         for name in config.methods:
             begun = time.perf_counter()
             # What was trained for one direction serves every judgement of it.
-            result = _dense.judge(name, case, config.folder(), options, regions, trained=source.path.name)[0.0]
+            result = _dense.judge(name, case, config.folder(), options, regions, trained=title[0])[0.0]
             seconds += result.seconds
             for region, mask in regions.items():
                 mean, std = result.distances.mean_std(mask)

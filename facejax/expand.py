@@ -3,13 +3,14 @@
     vertices = neutral + expand.apply(params, landmark_displacements, neutral)
 
 What the linear answer has to know of a face is worked out once, on the host, and remembered for the last few faces:
-half a second each. `pack` and `unpack` are for files. N vertices, L landmarks, k components; millimetres.
+a fifth of a second each. `pack` and `unpack` are for files. N vertices, L landmarks, k components; millimetres.
 """
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import math
 from collections import OrderedDict
 from typing import Any, NamedTuple
 
@@ -46,7 +47,8 @@ def apply(
     (`gpmm.noise_of`). The linear answer takes it into account, and goes unrefined, since the network has learnt from
     landmarks that are right.
 
-    Raises `ValueError` for other shapes, and for a face that is traced: each is prepared on the host.
+    Raises `ValueError` for other shapes, for a face that is traced (each is prepared on the host), and for `noise`
+    where the linear answer was kept as one map for all faces (`pack`).
     """
     if isinstance(neutral, jax.core.Tracer):
         raise ValueError(
@@ -60,8 +62,8 @@ def apply(
     if noise or not refined:
         return base
     lead = base.shape[:-2]
-    flat = base.reshape(-1, *base.shape[-2:])
-    marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), -1, 3)
+    flat = base.reshape(math.prod(lead), *base.shape[-2:])
+    marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), len(params.base.landmark_index), 3)
     rest = jnp.broadcast_to(jnp.asarray(neutral, jnp.float32), flat.shape)
     return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
 

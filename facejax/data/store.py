@@ -5,7 +5,7 @@
     neutral.npy     (S, N, 3) float32   each subject at rest
     landmarks.npy   (R, L, 3) float32   every frame of every sequence, one after the other
     vertices.npy    (G, N, 3) float32   meshes of the frames that were drawn
-    drawn.npy       (G,) int64          their rows in landmarks.npy
+    drawn.npy       (G,) int64          their rows in landmarks.npy, rising
     landmark_index.npy (L,) int32       landmarks as vertices
 
 Millimetres, y up, z forward.
@@ -87,8 +87,9 @@ def open_store(path: Path) -> Store:
         index = json.loads((path / "index.json").read_text())
     except (OSError, ValueError) as error:
         raise StoreError(f"{path / 'index.json'} cannot be read ({error}): is this a prepared dataset?") from error
-    if index.get("schema") != SCHEMA:
-        raise StoreError(f"{path}: schema {index.get('schema')}, expected {SCHEMA}: prepare the dataset anew")
+    if not isinstance(index, dict) or index.get("schema") != SCHEMA:
+        found = index.get("schema") if isinstance(index, dict) else None
+        raise StoreError(f"{path}: schema {found}, expected {SCHEMA}: prepare the dataset anew")
     arrays = {}
     for name in ("faces", "neutral", "landmarks", "vertices", "drawn", "landmark_index"):
         try:
