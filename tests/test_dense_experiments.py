@@ -1,11 +1,12 @@
 """The experiments on landmarks -> mesh, on tiny datasets and for a step or two: they run, keep results, go on."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
-from experiments import _cases, _dense, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
+from experiments import _cases, _dense, _run, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
 from facejax import evaluation, fit_gpmm, methods
 from facejax.data import store
 from facejax.data.meshes import of_split
@@ -155,10 +156,16 @@ def test_table2_carries_a_recording_to_others(tiny, tmp_path, monkeypatch):
     config = table2.Config(
         recording=take, out=tmp_path / "o", quick=True, people=1, passages=2, seconds=0.5, methods=("still", "rbf")
     )
-    with pytest.raises(ValueError, match="--people: expected 1 to 0"):
+    with pytest.raises(ValueError, match="expected two or more test subjects, got 1"):
         table2.run(config)
     monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
     monkeypatch.setattr(table2, "LEVEL", 0)
+    for wrong, message in (
+        ({"people": 0}, "--people and --passages of 1 or more"),
+        ({"seconds": 9.0}, "--seconds: exp"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            table2.run(dataclasses.replace(config, **wrong))
     rows = {(r["method"], r["region"]): r for r in table2.run(config)["rows"]}
     check(tmp_path / "o", "rows", "window")
     assert rows["rbf", "face"]["own_mm"] < rows["still", "face"]["own_mm"]
@@ -180,6 +187,31 @@ def test_figures_of_faces(tiny, tmp_path):
     assert {p.name for p in (tmp_path / "b").glob("*.glb")} == {
         "chain1.glb", "chain2.glb", "source.glb", "transfer1.glb", "transfer2.glb",
     }  # fmt: skip
+
+
+def test_datasets_have_folders_of_their_own(tmp_path):
+    plain, own, other = (
+        table1.Config(out=tmp_path, data=data) for data in (None, tmp_path / "a" / "store", tmp_path / "b" / "store")
+    )
+    folders = [config.folder() for config in (plain, own, other, dataclasses.replace(own, quick=True))]
+    assert folders[0] == tmp_path and len(set(folders)) == 4
+    assert folders[3] == folders[1] / "quick" and folders[1].name.startswith("store-")
+
+
+def test_only_the_full_experiment_is_published(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["table1", "--publish", "--quick", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        _run.main("table1", table1.Config, table1.run)
+    assert end.value.code == 2 and "leave out --quick" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_two_datasets_in_other_topologies_are_told(tiny_store):
+    _cases.check_alike(tiny_store, tiny_store)
+    with pytest.raises(ValueError, match="have other landmarks"):
+        _cases.check_alike(tiny_store, tiny_store._replace(landmark_index=np.asarray(tiny_store.landmark_index)[::-1]))
+    with pytest.raises(ValueError, match="have other triangles"):
+        _cases.check_alike(tiny_store, tiny_store._replace(faces=np.asarray(tiny_store.faces)[:-1]))
 
 
 def test_modes_exclude_each_other():

@@ -99,6 +99,11 @@ def test_told_of_noise_it_trusts_landmarks_less(params, person):
     assert right[0] < 1.2 * right[1]
     with pytest.raises(ValueError, match="noise: expected 0 mm or more, got -1"):
         expand.apply(params, marks, neutral, noise=-1)
+    with pytest.raises(ValueError, match="expected one or more frames of finite numbers"):
+        expand.apply(params, np.full_like(marks, np.nan), neutral, noise=None)
+    with pytest.raises(ValueError, match="expected one or more frames of finite numbers"):
+        expand.apply(params, marks[:0], neutral, noise=None)
+    assert expand.apply(params, marks[:0], neutral).shape == (0, *neutral.shape)
     with pytest.raises(ValueError, match="kept as one map"):
         gpmm.told(params.base._replace(statistics=linear.Params(jnp.zeros((5, 3)), jnp.zeros((162, 3)), ())), 0.5)
 

@@ -157,6 +157,10 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
     found = figure9.run(figure9.Config(out=tmp_path / "b", data=own, model=model))
     assert [row["target"] for row in found["transfer"]] == ["p14", "p15"]
     assert all(0 < row["mean_mm"] < 3 * row["still_mm"] for row in found["transfer"])
+    with pytest.raises(ValueError, match="name one of them"):
+        figure9.run(figure9.Config(out=tmp_path / "b", data=own, model=model, recording=tmp_path / "take.csv"))
+    with pytest.raises(ValueError, match="made of another dataset than makehuman4d: name it with --data"):
+        figure9.run(figure9.Config(out=tmp_path / "b", model=model))
     with pytest.raises(ValueError, match="--people: expected three of"):
         figure9.run(figure9.Config(out=tmp_path / "b", data=own, model=model, people=(1, 2, 99)))
 

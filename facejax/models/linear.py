@@ -66,10 +66,11 @@ def apply(params: Params, landmarks: jax.Array) -> jax.Array:
     expected = params.landmark_mean.shape
     if landmarks.shape[-2:] != expected:
         raise ValueError(f"landmarks: expected (..., {expected[0]}, 3), got {landmarks.shape}")
-    x = (landmarks - params.landmark_mean).reshape(*landmarks.shape[:-2], -1)
+    # Sizes are named, so that there may be no frames.
+    x = (landmarks - params.landmark_mean).reshape(*landmarks.shape[:-2], 3 * expected[0])
     for factor in params.factors:
         x = x @ factor
-    return params.vertex_mean + x.reshape(*x.shape[:-1], -1, 3)
+    return params.vertex_mean + x.reshape(*x.shape[:-1], *params.vertex_mean.shape)
 
 
 def affine(landmark_mean: np.ndarray, vertex_mean: np.ndarray, *factors: np.ndarray) -> Params:

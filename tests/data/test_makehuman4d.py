@@ -88,6 +88,7 @@ def test_interpolated_transitions_join_the_peaks(tiny_store):
             r"drawn.npy has shape \(3,\), expected \(60,\)",
         ),
         (lambda path: (path / "index.json").write_text(json.dumps({"schema": 99})), "schema 99, expected 1"),
+        (lambda path: (path / "index.json").write_text("[]"), "schema None, expected 1"),
     ],
 )
 def test_damaged_store_is_named(tiny_spec, tmp_path, damage, message):
