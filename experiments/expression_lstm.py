@@ -97,6 +97,8 @@ class Config:
 
 def run(config: Config) -> dict[str, Any]:
     """Train every variant, choose one on people that it has not seen, judge it on others."""
+    if config.release and config.data is not None:
+        raise ValueError("--release puts networks of makehuman4d into the package: leave out --data")
     begun = time.perf_counter()
     nets = {name: train(config, name) for name in config.variants}
     table = {name: scores(config, VARIANTS[name], params, CHOICE) for name, params in nets.items()}
@@ -108,8 +110,6 @@ def run(config: Config) -> dict[str, Any]:
     metrics = {"chosen": name, "choice": table, "test": judged, "test_alone": alone, "train_seconds": seconds}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=_dataset(config, variant).index["spec"])
     networks = networks._replace(about={"made": made, "variant": name, "plan": variant.plan._asdict(), "test": judged})
-    if config.release and config.data is not None:
-        raise ValueError("--release puts networks of makehuman4d into the package: leave out --data")
     for path in [config.out / expressions.RELEASED] + [PACKAGED] * config.release:
         expressions.save(path, networks)
     figure = _scored.plot(config.out / "expression_lstm.png", judged)

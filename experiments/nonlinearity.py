@@ -196,9 +196,10 @@ def _plot(path: Path, rows, floors, config: Config) -> Path:
                 axis.set(title=f"{split}: registration noise {noise:g}, landmarks off by {off:g} mm", yscale="log",
                          xlabel="level of realism", xticks=places)  # fmt: skip
                 axis.set_xticklabels(config.levels)
-                axis.title.set_fontsize(9)
+                axis.title.set_fontsize(8)
         line[0].set_ylabel("mean vertex error of the face, mm")
-    axes[0, 0].legend(frameon=False, fontsize=7)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, fontsize=9, loc="outside right center")
     return _dense.drawn(figure, path)
 
 

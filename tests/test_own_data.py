@@ -126,6 +126,9 @@ def test_expression_networks(own_cache, own, tmp_path):  # noqa: F811
     expression_lstm.run(expression_lstm.Config(out=tmp_path / "o", data=own, steps=2, variants=("truth",)))
     assert set(check(tmp_path / "o", "test")["test"]) == set(LABELS[1:])
     assert (tmp_path / "o" / "sheet.png").exists()
+    with pytest.raises(ValueError, match="leave out --data"):
+        expression_lstm.run(expression_lstm.Config(out=tmp_path / "p", data=own, release=True))
+    assert not (tmp_path / "p").exists()
 
 
 def test_warps(own_cache, own, tmp_path):  # noqa: F811
