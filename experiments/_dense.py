@@ -51,6 +51,8 @@ class Options:
     """Train for the paper's 300 epochs."""
     publish: bool = False
     """Also write the figures that the README quotes."""
+    trained_on: str = ""
+    """For the record: the machine that trained the checkpoints in the folder, where it is not this one."""
 
     @property
     def mode(self) -> Mode:

@@ -48,7 +48,8 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
 
 def _check_publish(config: Any) -> None:
     """What the README quotes is of the full experiment on the embedded data."""
-    given = [name for name in ("data", "first", "second", "speech", "quick") if getattr(config, name, None)]
+    wrong = ["data", "first", "second", "speech", "quick"] + ["folds"] * (not getattr(config, "paper", False))
+    given = [name for name in wrong if getattr(config, name, None)]
     if getattr(config, "publish", False) and given:
         raise ValueError(f"--publish writes what the README quotes: leave out --{', --'.join(given)}")
 
@@ -67,7 +68,8 @@ def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None
             "python": platform.python_version(),
             "jax": jax.__version__,
             "numpy": np.__version__,
-        },
+        }
+        | ({"trained_on": elsewhere} if (elsewhere := getattr(config, "trained_on", "")) else {}),
         "seed": config.seed,
         "seconds": round(seconds, 1),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
@@ -84,7 +86,10 @@ def finish(
     table: str,
     figure: Path | None = None,
 ) -> None:
-    """Write the config, the metrics with their record, and the table; publish them if asked."""
+    """Write the config, the metrics with their record, and the table; publish them if asked.
+
+    What the paper's 300 epochs gave is published beside the experiment's own figures, as NAME-paper.
+    """
     out = Path(config.out)
     document = {**metrics, "made": made}
     write_text(out / "config.json", json.dumps(dataclasses.asdict(config), indent=1, default=_plain) + "\n")
@@ -93,6 +98,7 @@ def finish(
     body = f"{table}\n\nMade by {source}.\n"
     write_text(out / "table.md", body)
     if config.publish:
+        name += "-paper" * getattr(config, "paper", False)
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
         write_text(RESULTS / f"{name}.md", body)
         if figure is not None:

@@ -198,12 +198,34 @@ def test_datasets_have_folders_of_their_own(tmp_path):
     assert folders[3] == folders[1] / "quick" and folders[1].name.startswith("store-")
 
 
-def test_only_the_full_experiment_is_published(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["table1", "--publish", "--quick", "--out", str(tmp_path)])
+@pytest.mark.parametrize("less", [["--quick"], ["--folds", "1"]])
+def test_only_the_full_experiment_is_published(tmp_path, capsys, monkeypatch, less):
+    monkeypatch.setattr("sys.argv", ["table1", "--publish", *less, "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as end:
         _run.main("table1", table1.Config, table1.run)
-    assert end.value.code == 2 and "leave out --quick" in capsys.readouterr().err
+    assert end.value.code == 2 and f"leave out {less[0]}" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_figures_of_the_papers_epochs_do_not_replace_the_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(_run, "RESULTS", tmp_path / "results")
+    for paper in (False, True):
+        config = table1.Config(out=tmp_path, publish=True, paper=paper, trained_on="a GPU" * paper)
+        made = _run.record(config, seconds=1.0)
+        assert made["machine"].get("trained_on", "") == config.trained_on
+        _run.finish("table1", config, {"paper": paper}, made=made, table="| a |")
+    assert sorted(p.name for p in (tmp_path / "results").iterdir()) == [
+        "table1-paper.json", "table1-paper.md", "table1.json", "table1.md",
+    ]  # fmt: skip
+    assert json.loads((tmp_path / "results" / "table1.json").read_text())["paper"] is False
+
+
+def test_the_first_folds_alone(tiny_store, tmp_path):
+    plain = table1.Config(out=tmp_path, data=tiny_store.path, methods=("ridge",), splits=("identity",), quick=True)
+    rows = table1.run(dataclasses.replace(plain, folds=1))["rows"]
+    assert [len(row["folds_mm"]) for row in rows] == [1, 1]
+    with pytest.raises(ValueError, match="--folds 0"):
+        table1.run(dataclasses.replace(plain, folds=0))
 
 
 def test_two_datasets_in_other_topologies_are_told(tiny_store):

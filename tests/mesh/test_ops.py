@@ -36,13 +36,14 @@ def case(hierarchy, *, lift, batch, channels, out):
 SIZES = [(1, 4, 3), (8, 4, 3), (9, 5, 8), (3, 2, 12)]
 
 
+@pytest.mark.parametrize("conv", [ops.spiral_conv, ops.spiral_conv_at_once], ids=["by position", "at once"])
 @pytest.mark.parametrize(("batch", "channels", "out"), SIZES)
 @pytest.mark.parametrize("lift", [True, False])
 @pytest.mark.parametrize("hierarchy", [HIERARCHY, PADDED], ids=["full", "padded"])
-def test_convolution_and_its_gradients_equal_the_plain_form(hierarchy, lift, batch, channels, out):
+def test_convolution_and_its_gradients_equal_the_plain_form(hierarchy, lift, batch, channels, out, conv):
     x, kernel, stencil = case(hierarchy, lift=lift, batch=batch, channels=channels, out=out)
     expected, plain_vjp = jax.vjp(lambda x, k: plain(x, k, hierarchy, lift=lift), x, kernel)
-    found, vjp = jax.vjp(lambda x, k: ops.spiral_conv(x, k, stencil), x, kernel)
+    found, vjp = jax.vjp(lambda x, k: conv(x, k, stencil), x, kernel)
     np.testing.assert_allclose(found, expected, atol=2e-4, rtol=1e-4)
     cotangent = array(3, *found.shape)
     for a, b in zip(vjp(cotangent), plain_vjp(cotangent), strict=True):
