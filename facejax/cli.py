@@ -125,11 +125,14 @@ def _data(command: Data) -> None:
 
     command = command.what
     if isinstance(command, Prepare):
-        _said(
-            produce.prepare_folder(
-                command.root, command.out, landmarks=command.landmarks, unit=command.unit, rate=command.fps
-            )
-        )
+        made = produce.prepare_recordings(
+            command.source, command.root, command.out, landmarks=command.landmarks, unit=command.unit,
+            labels=command.labels, people=command.people, cuts=command.cuts, hold=command.hold, most=command.meshes,
+            workers=command.workers, rate=command.fps, rest=command.rest, gaps=command.gaps, template=command.template,
+            actors=command.actors,
+        )  # fmt: skip
+        splits = [f"{split}: {', '.join(names)}" for split, names in made.people().items() if names]
+        _said(([made.path], (*made.index["notes"], *splits)))
     elif command.sample is not None:
         print("\n".join(str(path) for path in produce.sample_faces(command.sample, command.count)))
     else:

@@ -50,8 +50,8 @@ class Animate:
     mesh: Path | None = None
     """Any face or head (PLY, OBJ, GLB, NPZ), in any topology, unit and pose. Default: a MakeHuman face."""
     landmarks: Path | None = None
-    """Its 68, 51 or 83 landmarks: JSON of vertices or positions, MeshLab .pp, or plain text. MakeHuman's head, 3,260
-    vertices, goes without."""
+    """Its 68, 66, 51 or 83 landmarks: JSON of vertices, positions or triangles, MeshLab .pp, plain text, or the
+    embedding of FLAME. MakeHuman's head, 3,260 vertices, goes without."""
     expression: str | None = None
     """Driven by an expression network: anger, disgust, fear, happiness, sadness or surprise."""
     end: str | None = None
@@ -132,22 +132,47 @@ class MakeHuman:
     """Where the dataset goes; the user's cache by default."""
 
 
+Layout = Literal["folder", "coma", "d3dfacs", "florence4d", "vocaset", "bu3dfe", "bu4dfe", "livelink"]
+
+
 @dataclasses.dataclass(frozen=True)
 class Prepare:
-    """Read your own registered meshes into a dataset."""
+    """Read recordings into a dataset: your own, or a dataset that you have. Stopped, it goes on when called again."""
 
-    source: Positional[Literal["folder"]]
-    """Where they come from: ROOT/SUBJECT/EXPRESSION/*.ply (.obj, .npy, .npz), or ROOT/SUBJECT/EXPRESSION.npz."""
+    source: Positional[Layout]
+    """How they lie. folder: ROOT/SUBJECT/RECORDING/*.ply (.obj, .npy, .npz), or ROOT/SUBJECT/RECORDING.npz."""
     root: Path
-    """The folder of the subjects' folders."""
-    landmarks: Path
-    """Landmarks of the first subject's neutral mesh: JSON of vertices or positions, MeshLab .pp, or plain text."""
+    """The dataset's folder."""
     out: Path
-    """Where the dataset goes: a folder that is not there yet."""
+    """Where the prepared dataset goes: a folder that is not there yet."""
+    landmarks: Path | None = None
+    """Of the first subject's neutral mesh: JSON of vertices, positions or triangles, MeshLab .pp, plain text, or the
+    embedding of FLAME. bu4dfe and livelink go without."""
     unit: Literal["mm", "cm", "m"] | None = None
     """Of the meshes; recognised by the size of the face by default."""
-    fps: float = 30.0
-    """Frames per second of the recordings."""
+    fps: float | None = None
+    """Frames per second of the recordings; the dataset's own by default, of folders 30."""
+    rest: Literal["first", "mean"] | None = None
+    """Who has no neutral mesh is at rest in the first frame of the first recording (default), or in the mean of the
+    first frames of all."""
+    gaps: bool = False
+    """Take recordings that lack frames as they are, and say so."""
+    hold: bool = False
+    """Take the rigid motion of the head out."""
+    labels: Path | None = None
+    """CSV of subject, recording, label; by default a label is the recording's name without a number at the end."""
+    people: Path | None = None
+    """CSV of subject and what is known: split (train, validation, test), sex."""
+    cuts: Path | None = None
+    """CSV of subject, recording, onset, apex_start, apex_end, offset, as frames from 0 on; found by default."""
+    template: Path | None = None
+    """vocaset: a mesh with FLAME's triangles."""
+    actors: int | None = None
+    """livelink: on how many MakeHuman people the recordings are played (12)."""
+    meshes: int = 20_000
+    """How many meshes are stored, drawn by a fixed seed; landmarks are stored of all frames."""
+    workers: int | None = None
+    """Processes; by default one for each processor where there is much to read."""
 
 
 @dataclasses.dataclass(frozen=True)

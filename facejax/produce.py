@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from facejax import animation, drive, files, io, pipeline, results
-from facejax.data import assets, folder, livelink, makehuman, makehuman4d, noise, portrait
+from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait, store
 from facejax.io import dress, faces
 
 
@@ -103,7 +103,6 @@ def fit(data: Path, out: Path, *, quick: bool = False, seed: int = 0) -> tuple[P
     steps, to see that everything is in order.
     """
     from facejax import fit_models, fit_motion, fit_residual
-    from facejax.data import store
 
     results.compile_cache()
     found = store.open_store(data)
@@ -120,14 +119,14 @@ def fit(data: Path, out: Path, *, quick: bool = False, seed: int = 0) -> tuple[P
     return out, errors
 
 
-def prepare_folder(
-    root: Path, out: Path, *, landmarks: Path, unit: str | None = None, rate: float = 30.0
-) -> tuple[list[Path], tuple[str, ...]]:
-    """Read a user's own meshes into a dataset; its folder, and what was assumed."""
-    results.check_rate(rate)
+def prepare_recordings(layout: str, root: Path, out: Path, **options) -> store.Store:
+    """Read a user's recordings into a dataset (`facejax.data.layouts.prepare`), with a progress bar."""
+    from facejax.data import layouts
+
+    if (rate := options.get("rate")) is not None:
+        results.check_rate(rate)
     with results.progress(out.name, None) as advance:
-        made = folder.prepare(root, out, landmarks=landmarks, unit=unit, rate=rate, progress=advance)
-    return [made.path], tuple(made.index["notes"])
+        return layouts.prepare(layout, root, out, progress=advance, **options)
 
 
 def view(path: Path, out: Path | None = None, *, fps: float | None = None) -> Path:

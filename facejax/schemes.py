@@ -1,10 +1,11 @@
-"""Which landmark is which: schemes of 68, 51 and 83 points, and what any two of them share.
+"""Which landmark is which: schemes of 68, 66, 51 and 83 points, and what any two of them share.
 
 Every point of a scheme has an anatomical name, and points of two schemes correspond when their names are equal.
 Left and right are the subject's, whatever the source calls them.
 
   68   iBUG 300-W, after Multi-PIE.
-  51   the same without the 17 of the jaw.
+  66   the same without the corners of the inner lip, as Saragih et al.'s trackers have it.
+  51   68 without the 17 of the jaw.
   83   BU-3DFE and BU-4DFE (Binghamton), the order of their .bnd files.
 
 BU-3DFE's order is not published as a list. Deep-MVLM's notes on the database (docs/BU-3DFE_landmark_info.txt) name 19
@@ -134,7 +135,7 @@ def by_count(count: int) -> Scheme:
 def common(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices (C,) into the scheme of `source` landmarks and (C,) into that of `target`, of the points they share.
 
-    In the source's order. 68 and 51 share 51; 68 and 83 share 47, 51 and 83 share 46.
+    In the source's order. 68 and 51 share 51; 68 and 83 share 47, 51 and 83 share 46; 66 shares 49 with 51, 45 with 83.
 
     Raises:
       ValueError: one of the counts is of no known scheme.
@@ -168,4 +169,10 @@ def _index(values) -> np.ndarray:
     return index
 
 
-_SCHEMES = {51: ("iBUG without jaw", _IBUG[17:]), 68: ("iBUG", _IBUG), 83: ("BU-3DFE", _BU)}
+_INNER_CORNERS = ("right inner lip corner", "left inner lip corner")
+_SCHEMES = {
+    51: ("iBUG without jaw", _IBUG[17:]),
+    66: ("iBUG without the inner lip's corners", tuple(p for p in _IBUG if p not in _INNER_CORNERS)),
+    68: ("iBUG", _IBUG),
+    83: ("BU-3DFE", _BU),
+}

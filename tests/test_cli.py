@@ -175,7 +175,7 @@ def test_own_meshes_become_a_dataset(capsys, tmp_path, capture):
     assert "read as metres" in err and "no neutral mesh" in err and "nobody serves validation and test" in err
     data = store.open_store(tmp_path / "o" / "own")
     assert data.labels == ("neutral", "big_smile") and data.index["rate"] == 60
-    assert data.index["notes"] == err.splitlines()
+    assert [*data.index["notes"], "train: S1"] == err.splitlines()
     np.testing.assert_allclose(np.linalg.norm(data.vertices[4], axis=-1), 110, atol=1e-3)
     # A dataset is not written over.
     code, printed, err = run(capsys, "data", "prepare", "folder", *options)
@@ -193,6 +193,9 @@ def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
     assert "--fps must lie above 0" in told("--landmarks", marks, "--fps", "0")
     (root / "S1" / "big smile" / "000004.ply").write_bytes(b"ply")
     assert "big smile/000004.ply" in told("--landmarks", marks, "--unit", "m")
+    (root / "S1" / "big smile" / "000004.ply").unlink()
+    assert "big smile: frame 4 is missing, after 000003.ply; allow gaps" in told("--landmarks", marks)
+    assert "folder: has no --template" in told("--landmarks", marks, "--template", marks)
     assert {path.name for path in tmp_path.iterdir()} == {"root", "marks.json"}
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from facejax import schemes
 
-COUNTS = (51, 68, 83)
+COUNTS = (51, 66, 68, 83)
 
 
 def test_documented_numbers_of_ibug():
@@ -70,6 +70,7 @@ def test_what_two_schemes_share(source, target):
     first, second = schemes.by_count(source), schemes.by_count(target)
     assert [first.points[i] for i in a] == [second.points[i] for i in b]
     wanted = {frozenset([51, 68]): 51, frozenset([68, 83]): 47, frozenset([51, 83]): 46}
+    wanted |= {frozenset([51, 66]): 49, frozenset([66, 83]): 45}
     assert len(a) == wanted.get(frozenset([source, target]), min(source, target))
     # The same pairs the other way round, and the mirror image of a pair is a pair.
     pairs = set(zip(a.tolist(), b.tolist(), strict=True))
@@ -81,6 +82,12 @@ def test_51_is_68_without_the_jaw():
     a, b = schemes.common(68, 51)
     np.testing.assert_array_equal(a, np.arange(17, 68))
     np.testing.assert_array_equal(b, np.arange(51))
+
+
+def test_66_is_68_without_the_corners_of_the_inner_lip():
+    a, b = schemes.common(68, 66)
+    assert set(range(68)) - set(a.tolist()) == {60, 64}
+    np.testing.assert_array_equal(b, np.arange(66))
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -143,7 +150,7 @@ def _place(point: str) -> tuple[float, float]:
 
 
 def test_unknown_counts_name_the_known():
-    with pytest.raises(ValueError, match="no scheme of 49 landmarks is known; known are 51, 68, 83"):
+    with pytest.raises(ValueError, match="no scheme of 49 landmarks is known; known are 51, 66, 68, 83"):
         schemes.by_count(49)
     with pytest.raises(ValueError, match="no scheme of 0 landmarks"):
         schemes.common(68, 0)

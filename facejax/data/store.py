@@ -39,6 +39,7 @@ class Sequence(NamedTuple):
     apex_end: int
     offset: int
     duration: float  # seconds
+    name: str = ""  # the recording's own
 
 
 class Store(NamedTuple):
@@ -64,6 +65,10 @@ class Store(NamedTuple):
         if split not in SPLITS:
             raise StoreError(f"unknown split {split!r}, expected one of {', '.join(SPLITS)}")
         return np.array([i for i, s in enumerate(self.index["subjects"]) if s["split"] == split], np.int64)
+
+    def people(self) -> dict[str, list[str]]:
+        """The names of each split's subjects."""
+        return {split: [s["name"] for s in self.index["subjects"] if s["split"] == split] for split in SPLITS}
 
     def row_subjects(self) -> np.ndarray:
         """The subject of each landmark row, (R,)."""

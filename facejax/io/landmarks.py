@@ -6,6 +6,7 @@
   .pp     MeshLab's PickedPoints: XML, one `<point x= y= z= name= active=>` each.
   .txt .csv .xyz .lnd .bnd   one landmark a line: `index`, `x y z`, or `index x y z` as in BU-4DFE, all lines alike;
           blanks, commas or semicolons between, `#` begins a comment, blank lines are passed over.
+  .npy .npz .pkl   FLAME's embedding (`facejax.io.embedding`), on a mesh with FLAME's triangles.
 
 Landmarks are in the mesh's own unit. A file is a claim to be checked: sizes are bounded, and XML may declare nothing.
 """
@@ -21,6 +22,7 @@ from xml.parsers import expat
 import numpy as np
 
 from facejax import files
+from facejax.io import embedding
 
 LIMIT = 2**22  # bytes of a file
 MOST = 10_000  # landmarks
@@ -64,7 +66,7 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
         size = path.stat().st_size
         if not 0 < size <= LIMIT:
             raise LandmarkError(f"{path}: {size} bytes; expected 1 to {LIMIT}")
-        found = reader(path.read_bytes(), mesh, faces)
+        found = reader(path if reader is _read_embedding else path.read_bytes(), mesh, faces)
         if mesh is not None:
             _near(found.points, mesh)
     except LandmarkError:
@@ -131,17 +133,28 @@ def _read_json(data: bytes, mesh, faces) -> Landmarks:
 
 def _on_faces(face: list, weights: list, mesh, faces) -> np.ndarray:
     """Positions (L, 3) of barycentric landmarks."""
-    if mesh is None or faces is None:
-        raise ValueError("landmarks on faces need the mesh's vertices and faces")
     if len(face) != len(weights):
         raise ValueError(f"{len(face)} faces but {len(weights)} weights")
+    table = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(weights)], np.float64)
+    return _placed(face, table, mesh, faces)
+
+
+def _placed(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
+    if mesh is None or faces is None:
+        raise ValueError("landmarks on faces need the mesh's vertices and faces")
     faces = np.asarray(faces)
     which = [_whole(v, f"faces[{i}]", len(faces), "triangles") for i, v in enumerate(face)]
-    table = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(weights)], np.float64)
-    bad = np.flatnonzero(np.abs(table.sum(1) - 1) > 1e-3)
+    bad = np.flatnonzero(~(np.abs(weights.sum(1) - 1) <= 1e-3))
     if len(bad):
-        raise ValueError(f"weights[{bad[0]}]: expected a sum of 1, got {table[bad[0]].tolist()}")
-    return np.einsum("lk,lkx->lx", table, mesh[faces[which]])
+        raise ValueError(f"weights[{bad[0]}]: expected a sum of 1, got {weights[bad[0]].tolist()}")
+    return np.einsum("lk,lkx->lx", weights, mesh[faces[which]])
+
+
+def _read_embedding(path: Path, mesh, faces) -> Landmarks:
+    face, weights = embedding.read(path)
+    if not 0 < len(face) <= MOST:
+        raise ValueError(f"expected 1 to {MOST} landmarks, got {len(face)}")
+    return Landmarks(_placed(face.tolist(), weights, mesh, faces), None)
 
 
 def _read_pp(data: bytes, mesh, faces) -> Landmarks:
@@ -271,4 +284,9 @@ def _diagonal(mesh: np.ndarray) -> float:
 
 
 _TEXTS = (".txt", ".csv", ".xyz", ".lnd", ".bnd")
-_READERS = {".json": _read_json, ".pp": _read_pp} | dict.fromkeys(_TEXTS, _read_text)
+_READERS = {
+    ".json": _read_json,
+    ".pp": _read_pp,
+    **dict.fromkeys(_TEXTS, _read_text),
+    **dict.fromkeys(embedding.SUFFIXES, _read_embedding),
+}

@@ -5,7 +5,6 @@ file is a claim to be checked: counts are held against the bytes that are there 
 nothing is unpickled.
 """
 
-import math
 import os
 import re
 import shutil
@@ -19,13 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax import files
-from facejax.io import glb, ply
+from facejax.io import arrays, glb, ply
+from facejax.io.arrays import LIMIT
 
-LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
-_ARRAY_HEADERS = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
 # What the readers, and the zip and array parsers below them, raise on damaged input.
 _DAMAGE = (
     ValueError,
@@ -92,22 +87,29 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
       MeshError: as `read`.
     """
     path = Path(path)
-    try:
-        arrays = _read_arrays(path, ("vertices", "faces", "landmarks", "fps"))
-    except FileNotFoundError:
-        raise MeshError(f"{path}: no such file") from None
-    except (OSError, *_DAMAGE) as error:
-        raise MeshError(f"{path}: {error}") from error
-    vertices, faces = arrays.pop("vertices"), arrays.pop("faces", None)
+    found = _told(path, arrays.read_npz, ("vertices", "faces", "landmarks", "fps"))
+    vertices, faces = found.pop("vertices"), found.pop("faces", None)
     if faces is None and not bare:
         raise MeshError(f"{path}: has no triangles, nothing to show")
     if vertices.ndim not in (2, 3) or 0 in vertices.shape:
         raise MeshError(f"{path}: vertices must be (T, N, 3) or (N, 3), got {vertices.shape}")
     first = _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
-    extra = {"landmarks": arrays["landmarks"]} if "landmarks" in arrays else {}
-    if "fps" in arrays:
-        extra["fps"] = float(arrays["fps"].ravel()[0])
+    extra = {"landmarks": found["landmarks"]} if "landmarks" in found else {}
+    if "fps" in found:
+        extra["fps"] = float(found["fps"].ravel()[0])
     return vertices, first.faces if bare else faces.astype(np.int32), extra
+
+
+def count_frames(path: str | os.PathLike) -> int:
+    """How many frames an NPZ of `vertices` (T, N, 3) holds; its numbers are not read.
+
+    Raises:
+      MeshError: as `read_animation`, or other `vertices`.
+    """
+    shape = _told(Path(path), arrays.shape_in_npz, "vertices")
+    if len(shape) != 3 or 0 in shape or shape[2] != 3:
+        raise MeshError(f"{path}: vertices must be (T, N, 3), got {shape}")
+    return shape[0]
 
 
 def write(path: str | os.PathLike, vertices, faces=None) -> None:
@@ -183,43 +185,21 @@ def _read_obj(path: Path):
 
 
 def _read_npz(path: Path):
-    arrays = _read_arrays(path, ("vertices", "faces"))
-    return arrays.get("vertices"), arrays.get("faces")
-
-
-def _read_arrays(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """The wanted arrays that an NPZ holds; the first must be there."""
-    with zipfile.ZipFile(path) as archive:
-        names = set(archive.namelist())
-        if f"{wanted[0]}.npy" not in names:
-            raise ValueError(f"holds no array {wanted[0]!r}, only {sorted(name[:-4] for name in names)}")
-        arrays = {}
-        for name in wanted:
-            if f"{name}.npy" in names:
-                with archive.open(f"{name}.npy") as stream:
-                    arrays[name] = _read_array(stream, archive.getinfo(f"{name}.npy").file_size, name)
-    return arrays
+    found = arrays.read_npz(path, ("vertices", "faces"))
+    return found.get("vertices"), found.get("faces")
 
 
 def _read_npy(path: Path):
-    with path.open("rb") as stream:
-        return _read_array(stream, path.stat().st_size, "array"), None
+    return arrays.read_npy(path), None
 
 
-def _read_array(stream, size: int, name: str) -> np.ndarray:
-    """One .npy stream of a known size, its header held against that size first."""
-    if size > LIMIT:
-        raise ValueError(f"{name}: {size} bytes, more than {LIMIT}")
-    version = np.lib.format.read_magic(stream)
-    if version not in _ARRAY_HEADERS:
-        raise ValueError(f"{name}: unknown array format {version}")
-    shape, fortran, dtype = _ARRAY_HEADERS[version](stream)
-    if dtype.hasobject or dtype.kind not in "fiu":
-        raise ValueError(f"{name}: must hold numbers, got {dtype}")
-    need, there = math.prod(shape) * dtype.itemsize, size - stream.tell()
-    if need != there:
-        raise ValueError(f"{name}: {shape} {dtype} needs {need} bytes, the file holds {there}")
-    return np.frombuffer(stream.read(need), dtype).reshape(shape, order="F" if fortran else "C")
+def _told(path: Path, reader, *options):
+    try:
+        return reader(path, *options)
+    except FileNotFoundError:
+        raise MeshError(f"{path}: no such file") from None
+    except (OSError, *_DAMAGE) as error:
+        raise MeshError(f"{path}: {error}") from error
 
 
 def _checked(path: Path, vertices, faces) -> Mesh:

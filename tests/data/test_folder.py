@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from facejax import io
-from facejax.data import folder, meshes, motions, store, tree
+from facejax.data import cuts, folder, ingest, meshes, motions, source, store
 
 MARKS = [0, 20, 61, 99, 140]
 CURVE = np.array([0, 0.02, 0.3, 0.7, 0.97, 1, 0.98, 0.6, 0.2, 0.03, 0], np.float32)  # a recording: how far it has gone
@@ -50,7 +50,7 @@ def prepared(root, **options):
 def test_both_layouts_come_back_exactly(capture, ball):
     seen = []
     data = prepared(capture, progress=lambda done, total: seen.append((done, total)))
-    assert seen == [(i, 24) for i in range(1, 25)]
+    assert seen == [(i, 12) for i in range(1, 13)]
     assert data.labels == ("neutral", "anger", "big_smile") and data.index["notes"] == [
         f"read as millimetres: {capture / 'S0' / 'neutral.ply'} is 200 mm in size"
     ]
@@ -129,7 +129,7 @@ def test_without_triangles_but_in_one_file(ball, tmp_path):
         np.savez(tmp_path / "root" / f"S{subject}" / "smile.npz", vertices=moved)
         np.save(tmp_path / "root" / f"S{subject}" / "neutral.npy", rest)
     io.landmarks.write(tmp_path / "marks.json", index=MARKS)
-    with pytest.raises(folder.FolderError, match="root: no mesh has triangles"):
+    with pytest.raises(source.SourceError, match="root: no mesh has triangles"):
         prepared(tmp_path / "root")
     np.savez(tmp_path / "root" / "S1" / "smile.npz", vertices=moved, faces=ball[1])
     data = prepared(tmp_path / "root")
@@ -150,7 +150,7 @@ def test_frames_and_subjects_are_in_natural_order(ball, tmp_path):
     np.testing.assert_array_equal(data.vertices, np.concatenate([moved, moved]))
     assert [s["name"] for s in data.index["subjects"]] == ["P9", "P10"]
     names = ["a", "a1", "a01", "a2b10", "a2b9", "a10", "B", "1"]
-    assert sorted(names, key=tree.natural) == ["1", "a", "a01", "a1", "a2b9", "a2b10", "a10", "B"]
+    assert sorted(names, key=source.natural) == ["1", "a", "a01", "a1", "a2b9", "a2b10", "a10", "B"]
 
 
 def test_a_missing_neutral_is_the_first_frame(capture, ball):
@@ -159,7 +159,7 @@ def test_a_missing_neutral_is_the_first_frame(capture, ball):
     np.savez(capture / "S3" / "anger.npz", vertices=shifted, faces=ball[1])
     data = prepared(capture)
     np.testing.assert_array_equal(data.neutral[3], shifted[0])
-    assert "no neutral mesh, at rest in the first frame of the first sequence: S3" in data.index["notes"]
+    assert "no neutral mesh, at rest in the first frame of the first recording: S3" in data.index["notes"]
 
 
 @pytest.mark.parametrize(("unit", "per"), [("metres", 1000), ("centimetres", 10), ("decimetres", 100)])
@@ -173,11 +173,11 @@ def test_units_are_recognised_and_said(capture, ball, unit, per):
 def test_a_unit_can_be_named(capture, ball):
     scaled(capture, ball, 2.0)  # 400 mm, the most that is taken for a head
     scaled(capture, ball, 1.01)
-    with pytest.raises(folder.FolderError, match=r"neutral.ply: 404 in size; expected a head .* name the unit"):
+    with pytest.raises(source.SourceError, match=r"neutral.ply: 404 in size; expected a head .* name the unit"):
         prepared(capture)
     data = prepared(capture, unit="cm")
     assert np.ptp(data.neutral[0], axis=0).max() == pytest.approx(4040, rel=1e-3)
-    with pytest.raises(folder.FolderError, match="unit: expected mm, cm, m or None, got 'inch'"):
+    with pytest.raises(source.SourceError, match="unit: expected mm, cm, m or None, got 'inch'"):
         folder.prepare(capture, capture / "x", landmarks="none", unit="inch")
 
 
@@ -191,7 +191,7 @@ def scaled(root, ball, by):
 
 def test_68_landmarks_tell_the_unit_of_any_mesh(template, tmp_path):
     points = template.vertices[template.landmarks]
-    assert np.linalg.norm(points - points.mean(axis=0)) == pytest.approx(folder.SPREAD, abs=0.1)
+    assert np.linalg.norm(points - points.mean(axis=0)) == pytest.approx(ingest.SPREAD, abs=0.1)
     # With shoulders the mesh is larger than a head; the landmarks are not. Three times as large, they are no face's.
     bust = np.concatenate([template.vertices, [[0, -700, 0]]]) / 1000
     rng = np.random.default_rng(0)
@@ -203,7 +203,7 @@ def test_68_landmarks_tell_the_unit_of_any_mesh(template, tmp_path):
     assert data.index["spec"]["unit"] == "metres"
     np.testing.assert_array_equal(data.vertices, (moved * 1000).astype(np.float32))
     np.savez(tmp_path / "root" / "S0" / "smile.npz", vertices=moved * 3, faces=template.faces)
-    with pytest.raises(folder.FolderError, match=r"smile.npz: frame 0: the face is .* name the unit: mm, cm, m"):
+    with pytest.raises(source.SourceError, match=r"smile.npz: frame 0: the face is .* name the unit: mm, cm, m"):
         folder.prepare(tmp_path / "root", tmp_path / "b", landmarks=tmp_path / "marks.json")
 
 
@@ -232,7 +232,7 @@ def test_what_lies_elsewhere_is_passed_over(capture, ball):
     (capture / "readme.txt").write_text("recorded on a Monday")
     data = prepared(capture)
     assert len(data.sequences) == 12
-    assert data.index["notes"][1:] == ["passed over, as meshes outside the folders of expressions: S0/scan.ply"]
+    assert data.index["notes"][1:] == ["passed over, as meshes outside the folders of recordings: S0/scan.ply"]
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_what_lies_elsewhere_is_passed_over(capture, ball):
 )
 def test_events(curve, expected):
     rest, way = np.random.default_rng(0).normal(size=(2, 7, 3))
-    assert folder.events(rest + np.array(curve)[:, None, None] * way, rest) == expected
+    assert cuts.find(rest + np.array(curve)[:, None, None] * way, rest) == expected
 
 
 def test_events_by_a_loop():
@@ -265,14 +265,14 @@ def test_events_by_a_loop():
             onset = t if energy[t] < 0.05 * max(energy) else onset
         for t in range(11, apex[-1], -1):
             offset = t if energy[t] < 0.05 * max(energy) else offset
-        assert folder.events(curve, rest) == (onset, apex[0], apex[-1], offset)
+        assert cuts.find(curve, rest) == (onset, apex[0], apex[-1], offset)
 
 
 def test_a_recording_with_one_half_is_said_and_used(capture, ball):
     for own in capture.iterdir():  # from rest to the apex, and no way back
         np.savez(own / "anger.npz", vertices=recording(ball, int(own.name[1:]), 2, CURVE[:6])[0], faces=ball[1])
     data = prepared(capture)
-    assert data.index["notes"][1:] == ["6 of 12 sequences do not end at rest: S0/anger, S1/anger, S2/anger and 3 more"]
+    assert data.index["notes"][1:] == ["6 of 12 recordings do not end at rest: S0/anger, S1/anger, S2/anger and 3 more"]
     halves = motions.halves(data, "train")
     pairs = list(zip(halves.start.tolist(), halves.end.tolist(), strict=True))
     assert pairs == [(0, 1), (0, 2), (2, 0)] * 4 and np.all(halves.seconds > 0)
@@ -354,16 +354,16 @@ def _index(index):
         (_nan_in_a_frame, r"S2/neutral.npy: vertex 30 is not finite"),
         (_unit, r"S5/neutral.ply: 0.001 times as large as \S*S0/neutral.ply"),
         (_cut, r"S5/Big-Smile/000003.ply: "),
-        (_both, r"S1/big_smile.npz: the expression 'big_smile' is Big-Smile already"),
+        (_both, r"S1/big_smile.npz: the recording 'big_smile' is Big-Smile already"),
         (_neutrals, r"S1: neutral.npy and neutral.ply, expected one face at rest"),
         (_formats, r"S1/Big-Smile: frames in .obj and .ply, expected one format"),
         (_one, r"S1/Big-Smile: 1 frame, expected 2 or more"),
         (_still, r"S1/anger.npz: its landmarks never leave the face at rest"),
         (_rate, r"S1/anger.npz: fps is 60, expected 30"),
         (lambda c, b: (c / "S1" / "empty").mkdir(), r"S1/empty: holds no frames; expected .ply, .obj, .npy, .npz"),
-        (lambda c, b: (c / "S9").mkdir(), r"S9: holds no expressions"),
+        (lambda c, b: (c / "S9").mkdir(), r"S9: holds no recordings"),
         (lambda c, b: (c / "S1" / "Neutral").mkdir(), r"S1/Neutral: the face at rest is one mesh"),
-        (lambda c, b: (c / "S1" / "a>b").mkdir(), r"S1/a>b: an expression's name cannot hold '>'"),
+        (lambda c, b: (c / "S1" / "a>b").mkdir(), r"S1/a>b: a recording's name cannot hold '>'"),
         (lambda c, b: np.savez(c / "S1" / "x.npz", vertices=b[0]), r"S1/x.npz: vertices must be \(T, N, 3\), got"),
         (lambda c, b: np.savez(c / "S1" / "x.npz", points=b[0]), r"S1/x.npz: holds no array 'vertices'"),
         (lambda c, b: (c / "S1" / "x.npz").write_bytes(b"PK cut"), r"S1/x.npz: "),
@@ -377,7 +377,7 @@ def _index(index):
 def test_what_is_wrong_is_named_and_nothing_is_written(capture, ball, damage, message):
     damage(capture, ball)
     before = sorted(capture.parent.rglob("*"))
-    with pytest.raises(folder.FolderError, match=message):
+    with pytest.raises(source.SourceError, match=message):
         prepared(capture)
     assert sorted(capture.parent.rglob("*")) == before
 
@@ -386,14 +386,14 @@ def test_requests_that_cannot_be_met(capture, ball, tmp_path):
     marks = tmp_path / "marks.json"
 
     def told(root, out, **options):
-        with pytest.raises(folder.FolderError) as error:
+        with pytest.raises(source.SourceError) as error:
             folder.prepare(root, out, landmarks=marks, **options)
         return str(error.value)
 
     (tmp_path / "file").write_text("here")
     assert "nowhere: no such folder" in told(tmp_path / "nowhere", tmp_path / "o")
     assert "file: not a folder" in told(tmp_path / "file", tmp_path / "o")
-    assert "Big-Smile: holds no expressions" in told(capture / "S0", tmp_path / "o")  # one folder too deep
+    assert "Big-Smile: holds no recordings" in told(capture / "S0", tmp_path / "o")  # one folder too deep
     assert "Big-Smile: holds no folders" in told(capture / "S0" / "Big-Smile", tmp_path / "o")
     assert "lies among the meshes" in told(capture, capture / "S0" / "store")
     assert f"{tmp_path / 'file'} is not a folder" in told(capture, tmp_path / "file" / "deeper" / "store")
@@ -414,6 +414,6 @@ def test_an_error_while_writing_leaves_nothing(capture, monkeypatch):
         if done == total // 2:
             (capture / "S5" / "Big-Smile" / "000003.ply").write_bytes(b"ply\n")
 
-    with pytest.raises(folder.FolderError, match=r"000003.ply"):
+    with pytest.raises(source.SourceError, match=r"000003.ply"):
         prepared(capture, progress=change)
     assert sorted(os.listdir(capture.parent)) == before

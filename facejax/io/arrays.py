@@ -1,0 +1,96 @@
+"""NPY and NPZ files from strangers: headers are held against the bytes before memory is taken; nothing is unpickled.
+
+Functions raise plain ValueError, and what `zipfile` raises on damage; `facejax.io.meshes` adds the file's name.
+"""
+
+import math
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def read_npz(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The wanted arrays that an NPZ holds; the first must be there."""
+    with zipfile.ZipFile(path) as archive:
+        names = _names(archive, wanted[0])
+        found = {}
+        for name in wanted:
+            if name in names:
+                with archive.open(f"{name}.npy") as stream:
+                    found[name] = _read(stream, archive.getinfo(f"{name}.npy").file_size, name)
+    return found
+
+
+def read_some(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Those of the named arrays that an NPZ holds."""
+    with zipfile.ZipFile(path) as archive:
+        there = {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
+    found = tuple(name for name in names if name in there)
+    return read_npz(path, found) if found else {}
+
+
+def shape_in_npz(path: Path, name: str) -> tuple[int, ...]:
+    """The shape of an array that must be in an NPZ; its numbers are not read."""
+    with zipfile.ZipFile(path) as archive:
+        _names(archive, name)
+        with archive.open(f"{name}.npy") as stream:
+            return _header(stream, archive.getinfo(f"{name}.npy").file_size, name)[0]
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of an NPY file."""
+    with path.open("rb") as stream:
+        return _read(stream, path.stat().st_size, "array")
+
+
+def map_npy(path: Path) -> np.ndarray:
+    """The same as a memory map, of any size."""
+    with path.open("rb") as stream:
+        _header(stream, path.stat().st_size, "array", limit=None)
+    return np.load(path, mmap_mode="r", allow_pickle=False)
+
+
+def skip_object_header(stream) -> None:
+    """Go to the pickle of an NPY file that holds one object. Raises `ValueError` for any other."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"unknown array format {version}")
+    shape, _, dtype = _HEADERS[version](stream)
+    if shape != () or not dtype.hasobject:
+        raise ValueError(f"expected one object, got {shape} {dtype}")
+
+
+def _names(archive: zipfile.ZipFile, needed: str) -> set[str]:
+    names = {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
+    if needed not in names:
+        raise ValueError(f"holds no array {needed!r}, only {sorted(names)}")
+    return names
+
+
+def _read(stream, size: int, name: str) -> np.ndarray:
+    """One .npy stream of a known size."""
+    shape, fortran, dtype, need = _header(stream, size, name)
+    return np.frombuffer(stream.read(need), dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _header(stream, size: int, name: str, *, limit: int | None = LIMIT) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+    """Shape, order, type and bytes that the header claims, held against the size."""
+    if limit is not None and size > limit:
+        raise ValueError(f"{name}: {size} bytes, more than {limit}")
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"{name}: unknown array format {version}")
+    shape, fortran, dtype = _HEADERS[version](stream)
+    if dtype.hasobject or dtype.kind not in "fiu":
+        raise ValueError(f"{name}: must hold numbers, got {dtype}")
+    need, there = math.prod(shape) * dtype.itemsize, size - stream.tell()
+    if need != there:
+        raise ValueError(f"{name}: {shape} {dtype} needs {need} bytes, the file holds {there}")
+    return shape, fortran, dtype, need
