@@ -6,10 +6,9 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from PIL import Image
 
 from experiments import _run
-from facejax import animation, expressions, files
+from facejax import animation, expressions
 from facejax.data import makehuman, store
 from facejax.io import dress, render
 
@@ -129,5 +128,4 @@ def sheet(path: Path, networks: expressions.Expressions, data: store.Store | Non
         parts = dress.parts(teeth, face.landmarks, marks)
         moved = np.asarray(animation.move(face, chosen))
         rows.append(render.frames(moved, face.faces, size=PICTURE, camera=camera, extras=parts))
-    with files.replacing(path) as temporary:
-        Image.fromarray(render.contact_sheet(rows, row_labels=list(networks.labels))).save(temporary)
+    render.save(path, render.contact_sheet(rows, row_labels=list(networks.labels)))

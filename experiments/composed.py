@@ -21,7 +21,6 @@ from typing import Any
 import jax
 import matplotlib
 import numpy as np
-from PIL import Image
 
 from experiments import _cases, _judged, _run
 from facejax import composition, files, io, metrics, pipeline
@@ -205,8 +204,7 @@ def _picture(out: Path, models: pipeline.Models, labels, seed: int) -> None:
     pictures = io.render.frames(vertices, face.faces, size=(160, 200), extras=parts)
     pictures = sheet.caption(pictures, tuple((i, name.replace("_", " ")) for i, name in enumerate(labels)))
     rows = [pictures[:7], pictures[7:14], pictures[14:]]
-    with files.replacing(out / "chain.png") as temporary:
-        Image.fromarray(sheet.contact_sheet(rows)).save(temporary, "PNG")
+    sheet.save(out / "chain.png", sheet.contact_sheet(rows))
 
 
 if __name__ == "__main__":

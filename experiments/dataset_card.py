@@ -19,7 +19,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from PIL import Image
 
 from experiments import _cases, _run
 from facejax import evaluation, files
@@ -161,7 +160,7 @@ def _sheet(path: Path, config: Config) -> None:
         )
         for part in (slice(0, half), slice(half, None))
     ]
-    _save(path, np.concatenate(sheets))
+    render.save(path, np.concatenate(sheets))
 
 
 def _farthest(path: Path, data: store.Store) -> None:
@@ -178,7 +177,7 @@ def _farthest(path: Path, data: store.Store) -> None:
             row.append(render.image(shown, faces, size=PICTURE, camera=render.aim(rest * 1.08, size=PICTURE, turn=18)))
         rows.append(row)
     known = [data.index["subjects"][person]["name"] for person in people]
-    _save(path, render.contact_sheet(rows, row_labels=known, column_labels=names))
+    render.save(path, render.contact_sheet(rows, row_labels=known, column_labels=names))
 
 
 def _ladder(path: Path, config: Config) -> None:
@@ -188,7 +187,7 @@ def _ladder(path: Path, config: Config) -> None:
     person = makehuman.subject(SHOWN[2], seed=config.seed)
     rows = [[_portrait(v) for v in rig.pose(rig.build(person, level=level), weights)] for level in rig.LEVELS]
     names = [f"level {level}" for level in rig.LEVELS]
-    _save(path, render.contact_sheet(rows, row_labels=names, column_labels=list(labels)))
+    render.save(path, render.contact_sheet(rows, row_labels=names, column_labels=list(labels)))
 
 
 def _portrait(vertices: np.ndarray) -> np.ndarray:
@@ -197,11 +196,6 @@ def _portrait(vertices: np.ndarray) -> np.ndarray:
     camera = render.aim(shape.vertices * 1.08, size=PICTURE, turn=18)
     skin, parts = vertices[None, : len(shape.vertices)], portrait.parts(vertices[None])
     return render.frames(skin, shape.faces, size=PICTURE, camera=camera, extras=parts)[0]
-
-
-def _save(path: Path, pixels: np.ndarray) -> None:
-    with files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary)
 
 
 def _quantiles(speeds: np.ndarray) -> dict[str, float]:

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from experiments import _cases, _dense, _run
-from facejax import files, methods
+from facejax import methods
 from facejax.io import render
 
 METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "neural3dmm", "s2d", "gpmm", "s2d_residual")
@@ -72,8 +71,7 @@ def run(config: Config) -> dict[str, Any]:
         column_labels=["true", *(_dense.NAMES[name] for name in config.methods)],
     )
     path = config.out / "figure6.png"
-    with files.replacing(path) as temporary:
-        Image.fromarray(sheet).save(temporary)
+    render.save(path, sheet)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     metrics = {"mode": mode, "red_mm": config.high, "rows": rows}
     _run.finish("figure6", config, metrics, made=made, table=_table(rows, config), figure=path)

@@ -20,10 +20,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from PIL import Image
 
 from experiments import _judged, _run, _transferred
-from facejax import drive, files, io, pipeline, results
+from facejax import drive, io, pipeline, results
 from facejax.data import makehuman, makehuman4d, performance, rig, store
 from facejax.io import dress, render
 
@@ -97,8 +96,7 @@ def run(config: Config) -> dict[str, Any]:
         io.save(config.out / f"{name}.glb", vertices, models.face.faces, extras=extras)
         rows.append(_pictures(models, take.rest, vertices, extras))
     path = config.out / "figure9.png"
-    with files.replacing(path) as temporary:
-        Image.fromarray(render.contact_sheet(rows, row_labels=labels)).save(temporary)
+    render.save(path, render.contact_sheet(rows, row_labels=labels))
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=_dataset(models))
     metrics = {"chains": chains, "transfer": errors, "recording": config.recording and config.recording.name}
     body = [(e["target"], f"{e['mean_mm']:.3f}", f"{e['still_mm']:.3f}") for e in errors]

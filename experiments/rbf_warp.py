@@ -22,15 +22,13 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from PIL import Image
 
 from experiments import _run
 from experiments._warped import Face, Form, heat, others, regions_of, remeshed, sequence, still, weights
-from facejax import files
 from facejax.data import makehuman4d, store
 from facejax.data.meshes import of_split
 from facejax.geometry import rbf
-from facejax.io import dress
+from facejax.io import dress, render
 from facejax.mesh import ops
 
 matplotlib.use("Agg")
@@ -102,9 +100,9 @@ def run(config: Config) -> dict[str, Any]:
         "faces": others(data, chosen, odd),
     }
     for name, pixels in pictures.items():
-        _save(config.out / f"{name}.png", pixels)
+        render.save(config.out / f"{name}.png", pixels)
         if config.publish:
-            _save(_run.RESULTS / f"rbf_warp_{name}.png", pixels)
+            render.save(_run.RESULTS / f"rbf_warp_{name}.png", pixels)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("rbf_warp", config, metrics, made=made, table=_table(metrics), figure=figure)
     return metrics
@@ -232,11 +230,6 @@ def _plot(path: Path, sweep: list[dict[str, Any]]) -> Path:
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path
-
-
-def _save(path: Path, pixels: np.ndarray) -> None:
-    with files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary)
 
 
 def _name(form: dict[str, Any]) -> str:

@@ -22,9 +22,8 @@ from facejax import pipeline, schemes
 from facejax.geometry import align, rbf
 from facejax.io import faces
 from facejax.io.meshes import MeshError
-from facejax.mesh import attachment
+from facejax.mesh import attachment, graph
 
-WELD = 1e-7  # of the mesh's size: vertices nearer to one another are one
 ALIKE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
 
 
@@ -66,7 +65,7 @@ def prepare(
         shared = schemes.common(len(template), len(landmarks))
         points, wanted = landmarks[shared[1]], np.asarray(template, np.float64)[shared[0]]
         attachment.check(landmarks, vertices)
-        rotation, size = _place(points, wanted)
+        rotation, size = place(points, wanted)
         weights, loose = _weights(vertices, triangles, points, shared[0], len(template), pin, options)
     except ValueError as error:
         raise MeshError(f"{name}: {error}") from error
@@ -122,6 +121,24 @@ def landmarks_of(face: Face, curve: np.ndarray | jax.Array, *, intensity: float 
     return _at_rest(face) + intensity * face.size * jnp.asarray(curve)[..., face.shared[0], :] @ face.rotation.T
 
 
+def place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rotation (3, 3) from the template's landmarks (C, 3) to a mesh's, and the mesh's size against the template's.
+
+    Raises `ValueError` where the two are not alike.
+    """
+    spread, wanted = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (points, template))
+    shapes = ((p - p.mean(axis=0)) / s for p, s in ((points, spread), (template, wanted)))
+    shape, target = (s.astype(np.float32) for s in shapes)
+    fit = align.procrustes(target, shape, scaling=True)
+    off = float(np.linalg.norm(np.asarray(align.apply(fit, target)) - shape))
+    if off > ALIKE:
+        raise ValueError(
+            f"its {len(points)} landmarks do not form a face (distance {off:.2f} of at most {ALIKE}): are they "
+            "in the order of the scheme, left and right as the subject has them?"
+        )
+    return np.asarray(fit.rotation, np.float64), spread / wanted
+
+
 def check_intensity(intensity: float) -> None:
     """Raise `ValueError` for a scale of the motion out of 0..2."""
     if not 0 <= intensity <= 2:
@@ -140,20 +157,14 @@ def _move(vertices: jax.Array, weights: jax.Array, displacements: jax.Array) -> 
 def _weights(vertices, triangles, points, names, count, pin, options) -> tuple[np.ndarray, int]:
     """Weights (N, C) of the points (C, 3), and how many vertices are in no triangle.
 
-    Exporters double vertices along the seams of textures. On the mesh these are one: a seam is no rim, and ways along
-    the mesh cross it.
+    Seams of textures are no rims, and ways along the mesh cross them: vertices at one place are one.
     """
-    size = np.ptp(vertices, axis=0).max()
-    used, places = np.unique(triangles, return_inverse=True)
-    _, first, same = np.unique(np.round(vertices[used] / (WELD * size)), axis=0, return_index=True, return_inverse=True)
-    faces = same.reshape(-1)[places].reshape(-1, 3)
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    used, same, faces = graph.weld(vertices, triangles)
     lips = _lips(schemes.by_count(count).points, names)
     reach = attachment.REACH if pin else np.inf
-    found = attachment.weights(vertices[used][first], faces[whole], points, lips=lips, reach=reach, **options)
-    weights = np.zeros((len(vertices), len(points)), np.float32)
-    weights[used] = found[same.reshape(-1)]
-    return weights, len(vertices) - len(used)
+    found = attachment.weights(vertices[used], faces, points, lips=lips, reach=reach, **options)
+    weights = np.where(same[:, None] >= 0, found[same], 0).astype(np.float32)
+    return weights, int(np.sum(same < 0))
 
 
 def _lips(points: tuple[str, ...], which: np.ndarray) -> tuple[list[int], list[int]] | None:
@@ -161,18 +172,3 @@ def _lips(points: tuple[str, ...], which: np.ndarray) -> tuple[list[int], list[i
     shown = [points[i] for i in which]
     found = tuple([i for i, name in enumerate(shown) if f"{place} lip" in name] for place in ("upper", "lower"))
     return found if all(found) else None
-
-
-def _place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rotation (3, 3) from the template to the mesh, and the mesh's size against the template's."""
-    spread, wanted = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (points, template))
-    shapes = ((p - p.mean(axis=0)) / s for p, s in ((points, spread), (template, wanted)))
-    shape, target = (s.astype(np.float32) for s in shapes)
-    fit = align.procrustes(target, shape, scaling=True)
-    off = float(np.linalg.norm(np.asarray(align.apply(fit, target)) - shape))
-    if off > ALIKE:
-        raise ValueError(
-            f"its {len(points)} landmarks do not form a face (distance {off:.2f} of at most {ALIKE}): are they "
-            "in the order of the scheme, left and right as the subject has them?"
-        )
-    return np.asarray(fit.rotation, np.float64), spread / wanted

@@ -1,4 +1,4 @@
-"""The command line: `facejax generate | animate | demo | labels | data | fit | view`. A thin skin over the library.
+"""The command line: `facejax generate | animate | register | demo | labels | data | fit | view`, a thin skin.
 
 Bad input ends with one line on standard error, exit code 2, and nothing written.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import tyro
 
-from facejax.commands import Animate, Command, Data, Demo, Fit, Generate, Labels, Prepare, View
+from facejax.commands import Animate, Command, Data, Demo, Fit, Generate, Labels, Prepare, Register, View
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -33,15 +33,22 @@ def main(arguments: list[str] | None = None) -> None:
 def _generate(command: Generate) -> None:
     from facejax import produce
 
-    neutral, notes = produce.neutral_face(command.face, command.model)
-    for note in notes:
-        print(f"{command.face}: {note}", file=sys.stderr)
+    if command.landmarks is None:
+        face, notes = produce.neutral_face(command.face, command.model)
+        generate = produce.generate
+    elif command.face is None:
+        raise ValueError(f"--landmarks {command.landmarks}: of which scan? name it with --face")
+    else:
+        from facejax import scanned
+
+        face = scanned.read(command.face, command.landmarks)
+        notes, generate = face.notes, scanned.generate
     labels = (command.start, command.end, *command.then)
-    done = produce.generate(
-        neutral, labels, command.out, model=command.model, seed=command.seed, samples=command.samples,
+    done = generate(
+        face, labels, command.out, model=command.model, seed=command.seed, samples=command.samples,
         frames=command.frames, fps=command.fps, intensity=command.intensity, formats=command.formats,
     )  # fmt: skip
-    print("\n".join(str(path) for path in done))
+    _said((done, tuple(f"{command.face}: {note}" for note in notes)))
 
 
 def _animate(command: Animate) -> None:
@@ -107,6 +114,13 @@ def _said(result: tuple[list[Path], tuple[str, ...]]) -> None:
     print("\n".join(str(path) for path in done))
 
 
+def _register(command: Register) -> None:
+    from facejax import scanned
+
+    scan = scanned.read(command.scan, command.landmarks)
+    _said(scanned.save(scan, scanned.fit(scan), command.out))
+
+
 def _demo(command: Demo) -> None:
     from facejax import demo
 
@@ -161,6 +175,7 @@ def _view(command: View) -> None:
 _COMMANDS = {
     Generate: _generate,
     Animate: _animate,
+    Register: _register,
     Demo: _demo,
     Labels: _labels,
     Data: _data,

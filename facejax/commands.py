@@ -24,7 +24,10 @@ class Generate:
     then: UseAppendAction[tuple[str, ...]] = ()
     """A further expression; repeat the flag: `--then A --then B`."""
     face: Path | None = None
-    """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average."""
+    """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average. With
+    --landmarks any scan of a head."""
+    landmarks: Path | None = None
+    """Of a scan in any topology, whose own vertices are animated; see `facejax register`."""
     model: Path | None = None
     """Weights to use in place of the released ones."""
     seed: int = 7
@@ -94,6 +97,19 @@ class Animate:
     """Frames per second of the results; as the motion was made by default."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
     """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Register:
+    """Bring the template onto a scan of a head: any vertices, holes, noise, unit and pose."""
+
+    scan: Positional[Path]
+    """The scan: PLY, OBJ, GLB or NPZ."""
+    landmarks: Path
+    """On it: 68, 66, 51 or 83, or seven (outer and inner corner of the right eye, inner and outer of the left, tip of
+    the nose, right and left corner of the mouth), or any with names of the 68; formats as of `facejax animate`."""
+    out: Path
+    """Folder for the template on the scan, its 68 landmarks, a picture and the distances; made if it is missing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,6 +232,7 @@ class View:
 Command = (
     Annotated[Generate, subcommand("generate", prefix_name=False)]
     | Annotated[Animate, subcommand("animate", prefix_name=False)]
+    | Annotated[Register, subcommand("register", prefix_name=False)]
     | Annotated[Demo, subcommand("demo", prefix_name=False)]
     | Annotated[Labels, subcommand("labels", prefix_name=False)]
     | Annotated[Data, subcommand("data", prefix_name=False)]

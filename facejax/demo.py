@@ -10,7 +10,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from PIL import Image
 
 from facejax import files, io, pipeline, results
 from facejax.data import makehuman
@@ -48,7 +47,7 @@ def run(out: Path, *, seed: int = 7) -> Path:
             rows.append(_pictures(scene, chosen))
             clock.lap("contact sheet")
         labels = [f"frame {t + 1}" for t in chosen]
-        _picture(out / "contact_sheet.png", render.contact_sheet(rows, row_labels=names, column_labels=labels))
+        render.save(out / "contact_sheet.png", render.contact_sheet(rows, row_labels=names, column_labels=labels))
         advance()
         results.save_landmarks(out / "landmarks.npz", np.stack(marks), LABELS, 30, pipeline.RATE)
         advance()
@@ -59,11 +58,6 @@ def _pictures(scene: io.scene.Scene, chosen: np.ndarray) -> np.ndarray:
     parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
     camera = render.aim(scene.vertices, size=PICTURE, turn=15)
     return render.frames(scene.vertices[chosen], scene.faces, size=PICTURE, camera=camera, extras=parts)
-
-
-def _picture(path: Path, pixels: np.ndarray) -> None:
-    with files.replacing(path) as temporary:
-        Image.fromarray(pixels).save(temporary)
 
 
 class _Clock:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax.io import props, raster, scene, shade
-from facejax.io.sheet import caption, contact_sheet
+from facejax.io.sheet import caption, contact_sheet, save
 
-__all__ = ["Camera", "aim", "caption", "contact_sheet", "frames", "heat", "image"]
+__all__ = ["Camera", "aim", "caption", "contact_sheet", "frames", "heat", "image", "save"]
 
 SKIN_GLOSS = 0.30
 LANDMARK = (0.02, 0.55, 0.80)

@@ -1,7 +1,11 @@
 """Pictures with words: labelled grids and captions under a film."""
 
+import os
+
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+
+from facejax import files
 
 
 def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.ndarray:
@@ -42,6 +46,12 @@ def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.nda
                 raise ValueError(f"picture [{i}][{j}] must be {shape} as the first, got {np.shape(picture)}")
             sheet.paste(Image.fromarray(np.asarray(picture, np.uint8)), (left + j * (width + gap), y))
     return np.asarray(sheet)
+
+
+def save(path: str | os.PathLike, pixels) -> None:
+    """Write a picture (height, width, 3) uint8 as PNG, atomically."""
+    with files.replacing(path) as temporary:
+        Image.fromarray(np.asarray(pixels, np.uint8)).save(temporary)
 
 
 def caption(pictures, captions) -> np.ndarray:

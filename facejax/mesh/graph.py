@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csgraph, csr_array
 
+WELD = 1e-7  # of the mesh's size: vertices nearer to one another are one
+
 
 def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N, 3) float64 and (F, 3) int32 copies of a mesh.
@@ -25,6 +27,23 @@ def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if len(unused):
         raise ValueError(f"expected every vertex in a triangle, got {len(unused)} loose, first {unused[0]}")
     return vertices, faces.astype(np.int32)
+
+
+def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make vertices at one place one, as exporters double them along the seams of textures.
+
+    Which vertices (W,) stay, the place (N,) of each vertex among them, -1 where no triangle uses it, and the triangles
+    (F', 3) of those that stay, without what has shrunk to a line.
+    """
+    size = np.ptp(vertices, axis=0).max()
+    used, places = np.unique(faces, return_inverse=True)
+    _, first, same = np.unique(np.round(vertices[used] / (WELD * size)), axis=0, return_index=True, return_inverse=True)
+    same = same.reshape(-1)
+    joined = same[places].reshape(-1, 3)
+    whole = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
+    where = np.full(len(vertices), -1)
+    where[used] = same
+    return used[first], where, joined[whole]
 
 
 def edges(faces: np.ndarray) -> np.ndarray:

@@ -1,0 +1,207 @@
+"""Raw scans of heads: read, registered, animated in their own vertices. Files in, files out.
+
+V vertices of the scan, N of the template, L landmarks.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from facejax import animation, drive, files, io, pipeline, register, results, schemes
+from facejax.data import makehuman
+from facejax.io import dress, faces, render
+from facejax.io.meshes import MeshError
+from facejax.mesh import graph, nearest
+
+# The few landmarks that anybody can place, in this order where a file has seven and no names.
+SEVEN = (
+    "right eye outer corner", "right eye inner corner", "left eye inner corner", "left eye outer corner",
+    "nose tip", "right lip corner", "left lip corner",
+)  # fmt: skip
+PEOPLE, PEOPLE_SEED = 400, 2**16  # of a population that no experiment uses
+LEAST = 3
+PICTURE = (360, 440)
+RED = 2.0  # mm, where a picture of distances is darkest
+SHOWN = ("scan", "template", f"distance, dark at {RED:g} mm")
+
+
+class Scan(NamedTuple):
+    """A head in no topology."""
+
+    name: str
+    vertices: np.ndarray  # (V, 3) float64 mm, in its own place
+    faces: np.ndarray  # (F, 3)
+    landmarks: np.ndarray  # (L, 3) mm
+    which: np.ndarray  # (L,) of the 68
+    unit: float  # millimetres of the file's unit
+    notes: tuple[str, ...]
+
+
+@functools.cache
+def people() -> register.Shape:
+    """The morphable model of MakeHuman's people at rest; some seconds."""
+    template = makehuman.template()
+    drawn = [makehuman.subject(i, seed=PEOPLE_SEED).vertices for i in range(PEOPLE)]
+    return register.shape(np.stack(drawn), template.faces, template.landmarks)
+
+
+def read(path: Path, landmarks: Path) -> Scan:
+    """A scan and its landmarks: 68, 66, 51 or 83 of a scheme, the `SEVEN`, or any that bear names of the 68.
+
+    Raises `MeshError` or `LandmarkError`, naming the file.
+    """
+    mesh = io.load_mesh(path)
+    if mesh.faces is None:
+        raise MeshError(f"{path}: has no triangles, nothing to register")
+    found = io.landmarks.read(landmarks, mesh.vertices, mesh.faces)
+    which, kept = _known(found, landmarks)
+    points = found.points[kept]
+    template = makehuman.template()
+    wanted = template.vertices[template.landmarks[which]]
+    try:
+        _, size = animation.place(points, wanted)
+    except ValueError as error:
+        raise MeshError(f"{path}: {error}") from error
+    unit, name = faces.unit_of(size, str(path))
+    notes = [f"read as {name}"]
+    if len(which) < 68:
+        notes.append(f"{len(which)} of 68 landmarks are given, the others are estimated")
+    return Scan(path.stem, mesh.vertices * unit, mesh.faces, points * unit, which, unit, tuple(notes))
+
+
+def fit(scan: Scan) -> register.Registration:
+    """The template on the scan. Raises `MeshError` where landmarks and surface do not fit one another."""
+    try:
+        used, _, triangles = graph.weld(scan.vertices, scan.faces)
+        found = register.fit(people(), scan.vertices[used], triangles, scan.landmarks, scan.which)
+    except ValueError as error:
+        raise MeshError(f"{scan.name}: {error}") from error
+    if found.matched.mean() < 0.2:
+        raise MeshError(
+            f"{scan.name}: only {found.matched.mean():.0%} of a head lies on it: are the landmarks of this mesh?"
+        )
+    return found
+
+
+def save(scan: Scan, found: register.Registration, out: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """What registration gives: the template on the scan, its 68 landmarks, how far it lies off, and a picture.
+
+    The mesh and the landmarks are in the scan's own place and unit. The files, and what was assumed.
+    """
+    model = people()
+    results.writable(out)
+    marks = found.vertices[model.landmark_index]
+    hits = nearest.query(nearest.surface(scan.vertices, scan.faces), marks)
+    paths = [out / f"{scan.name}-{what}" for what in ("template.ply", "landmarks.json", "fit.json", "fit.png")]
+    io.save(paths[0], found.vertices / scan.unit, model.faces)
+    io.landmarks.write(paths[1], points=hits.points / scan.unit, names=schemes.by_count(68).points)
+    distance = found.distance[found.matched]
+    record = {
+        "mean_mm": float(distance.mean()),
+        "percentile95_mm": float(np.percentile(distance, 95)),
+        "matched": float(found.matched.mean()),
+        "largest_coefficient": float(np.abs(found.coefficients).max()),
+        "landmarks_given": len(scan.which),
+    }
+    with files.replacing(paths[2]) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n")
+    render.save(paths[3], render.contact_sheet([pictures(scan, found)], column_labels=SHOWN))
+    notes = list(scan.notes)
+    notes.append(
+        f"{record['mean_mm']:.2f} mm from the scan in the mean, over the {record['matched']:.0%} that it covers"
+    )
+    if record["largest_coefficient"] > 4:
+        notes.append("the face is unlike any of the people that the template knows: look at the picture")
+    return paths, tuple(notes)
+
+
+def pictures(scan: Scan, found: register.Registration) -> list[np.ndarray]:
+    """The scan, the template on it, and how far the two are apart (`SHOWN`), (height, width, 3) uint8 each."""
+    model = people()
+    there, placed = (x @ found.turn.T + found.move for x in (scan.vertices, found.vertices))
+    camera = render.aim(placed, size=PICTURE, turn=18)
+    colours = render.heat(np.where(found.matched, found.distance, 0.0), high=RED)
+    return [
+        render.image(there, scan.faces, size=PICTURE, camera=camera),
+        render.image(placed, model.faces, size=PICTURE, camera=camera),
+        render.image(placed, model.faces, size=PICTURE, camera=camera, colours=colours),
+    ]
+
+
+def generate(
+    scan: Scan,
+    labels: Sequence[str],
+    out: Path,
+    *,
+    model: Path | None = None,
+    seed: int = 7,
+    samples: int = 1,
+    frames: int | Sequence[int] | str = pipeline.FRAMES,
+    fps: float = 30.0,
+    intensity: float = 1.0,
+    formats: Sequence[str] = ("glb", "html", "webp"),
+) -> list[Path]:
+    """Animate a scan's own vertices through labels; as `produce.generate`. Millimetres, y up, z forward."""
+    results.compile_cache()
+    models = pipeline.load(model)
+    pipeline.label_indices(models, labels)
+    results.check_formats(formats)
+    results.check_rate(fps)
+    found, template = fit(scan), people()
+    if not np.array_equal(models.face.faces, template.faces):
+        raise ValueError(f"{model}: is in another topology than MakeHuman's, which scans are registered to")
+    if frames == drive.NATURAL:
+        frames = pipeline.durations(models, jax.random.key(seed), labels, rate=fps)
+    neutral, still = ((x @ found.turn.T + found.move).astype(np.float32) for x in (found.vertices, scan.vertices))
+    hung = register.carrier(neutral, template.faces, still, scan.faces)
+    landmarks = np.asarray(
+        pipeline.landmarks(
+            models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
+        )
+    )
+    results.writable(out)
+    written, captions = [], pipeline.captions(labels, frames=frames)
+    rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
+    with results.progress("writing", samples * len(formats) + 1) as advance:
+        for i, marks in enumerate(landmarks):
+            moved = still + register.carry(hung, np.asarray(pipeline.meshes(models, marks, neutral)) - neutral)
+            extras = dress.parts(models.props, rest, marks) if dress.has_eye_holes(still, scan.faces, rest) else ()
+            shot = io.scene.make(moved, scan.faces, captions=captions, landmarks=marks, extras=extras)
+            stem = f"{scan.name}-{results.stem(labels)}" + (f"-{i + 1}" if samples > 1 else "")
+            for suffix in formats:
+                written.append(results.save(out, stem, suffix, shot, fps))
+                advance()
+        path = out / f"{scan.name}-{results.stem(labels)}-landmarks.npz"
+        written.append(results.save_landmarks(path, landmarks, labels, frames, fps))
+        advance()
+    return written
+
+
+def _known(found: io.landmarks.Landmarks, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) of the 68 that are known, and (K,) which of the file's each is."""
+    names, count = schemes.by_count(68).points, len(found.points)
+    given = found.names if found.names is not None and set(found.names) & set(names) else None
+    if given is None and count == len(SEVEN):
+        given = SEVEN
+    if given is not None:
+        pairs = [(names.index(name), i) for i, name in enumerate(given) if name in names]
+        if len({a for a, _ in pairs}) < len(pairs):
+            raise io.landmarks.LandmarkError(f"{path}: a landmark's name comes twice")
+        which, kept = np.array(pairs, np.int64).reshape(-1, 2).T
+    else:
+        try:
+            which, kept = schemes.common(68, count)
+        except ValueError as error:
+            raise io.landmarks.LandmarkError(
+                f"{path}: {error}; or {len(SEVEN)} ({', '.join(SEVEN)}), or any with names of the 68"
+            ) from error
+    if len(which) < LEAST:
+        raise io.landmarks.LandmarkError(f"{path}: {len(which)} landmarks are known, expected {LEAST} or more")
+    return which, kept
