@@ -14,6 +14,7 @@ from facejax.mesh import attachment, topology
 
 MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
 FOLDS = 4
+SEXES = ("female", "male")
 QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
 Mode = Literal["quick", "default", "paper"]
 
@@ -38,7 +39,7 @@ def data_of(
 ) -> store.Store:
     """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
     if path is not None:
-        return store.open_store(path)
+        return store.open_meshes(path)
     size = QUICK if mode == "quick" else {}
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
@@ -61,19 +62,26 @@ def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
 
     `identity`: four folds over the sorted training and validation subjects. `expression`: four over the sorted names of
     CoMA's expressions, of the same people; other data: over all names. `test`: fitted to all those people, judged on
-    the test subjects. Datasets of OT23 4.1 that have splits of their own get them (D3DFACS, Florence 4D, BU-3DFE).
+    the test subjects. Datasets of OT23 4.1 get the paper's splits, over all their people: CoMA these folds, D3DFACS,
+    Florence 4D and BU-3DFE splits of their own.
     """
-    known = [split for split in ("train", "validation") if len(data.subjects(split))]
+    known = [split for split in _with_people(data) if split != "test"]
     people = at_most(of_split(data, *known))
+    name = data.index.get("name")
+    everybody = people if name not in _PUBLISHED else at_most(of_split(data, *_with_people(data)))
     found = []
     for split in splits:
         if split == "test":
             found.append(Case("test", 0, people, at_most(of_split(data, "test")), "subjects"))
         elif split in ("identity", "expression"):
-            found += _PUBLISHED.get(data.index.get("name"), _four_folds)(people, split)
+            found += _PUBLISHED.get(name, _four_folds)(everybody, split)
         else:
             raise ValueError(f"unknown split {split!r}, expected identity, expression or test")
     return found
+
+
+def _with_people(data: store.Store) -> list[str]:
+    return [split for split in store.SPLITS if len(data.subjects(split))]
 
 
 def _four_folds(people: Meshes, split: str) -> list[Case]:
@@ -99,6 +107,11 @@ def _florence(people: Meshes, split: str) -> list[Case]:
     if split == "expression":
         return _one_fold(people, split, _first_of_each(people, 2))
     sex = np.array([people.data.index["subjects"][i].get("sex", "") for i in people.subjects])
+    if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, SEXES)]]:
+        raise ValueError(
+            f"{people.data.path}: nothing says whether {unknown[0]} is female or male, by which Florence 4D is split: "
+            "prepare it with --people"
+        )
     held = np.concatenate([people.subjects[sex == "female"][-30:], people.subjects[sex == "male"][-10:]])
     return _one_fold(people, split, np.isin(people.owner, held))
 
@@ -118,7 +131,7 @@ def _first_of_each(people: Meshes, count: int) -> np.ndarray:
     return held
 
 
-_PUBLISHED = {"d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
+_PUBLISHED = {"coma": _four_folds, "d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
 
 
 def at_most(meshes: Meshes) -> Meshes:

@@ -60,7 +60,7 @@ def run(config: Config) -> dict[str, Any]:
         if config.data is None:
             data = makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes, config.seed))
         else:
-            data = store.open_store(config.data)
+            data = store.open_meshes(config.data)
         levels[str(level)] = _counts(data) | _linear_errors(data)
         histogram = _speeds(data)
     config.out.mkdir(parents=True, exist_ok=True)

@@ -129,7 +129,7 @@ def _performed(config: Config, models: pipeline.Models) -> list[_transferred.Tak
 
 def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_transferred.Take]]:
     """Two chains of a dataset's labels, and one label's recordings of three people."""
-    data = store.open_store(config.data)
+    data = store.open_meshes(config.data)
     _judged.fits(models, data, config.model or "the released models")
     held = np.concatenate([data.subjects(split) for split in ("test", "validation", "train")])
     numbers = list(config.people or held[:3].tolist())

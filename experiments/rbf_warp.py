@@ -111,7 +111,7 @@ def run(config: Config) -> dict[str, Any]:
 def _data(config: Config) -> store.Store:
     if config.data is None:
         return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
-    data = store.open_store(config.data)
+    data = store.open_meshes(config.data)
     if len(data.landmark_index) != dress.IBUG:
         raise ValueError(f"{data.path}: expected {dress.IBUG} landmarks, got {len(data.landmark_index)}")
     return data

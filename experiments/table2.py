@@ -121,7 +121,7 @@ def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.
 
 def _of_dataset(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
-    talk = store.open_store(config.speech)
+    talk = store.open_meshes(config.speech)
     _cases.check_alike(talk, data)
     people = talk.subjects("test") if len(talk.subjects("test")) > 1 else np.arange(len(talk.neutral))
     named = talk.labels[1:]

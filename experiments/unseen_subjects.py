@@ -76,7 +76,7 @@ def run(config: Config) -> dict[str, Any]:
 
 def _data(config: Config, level: int | str) -> store.Store:
     if config.data is not None:
-        return store.open_store(config.data)
+        return store.open_meshes(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
 
 

@@ -62,6 +62,8 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
 def check(data: store.Store) -> None:
     """Raise `ValueError` for a dataset that nothing can be learnt from, with what it lacks."""
     people = data.subjects("train")
+    if len(data.vertices) == 0:
+        raise ValueError(f"{data.path}: holds landmarks alone, expected meshes; `facejax.fit_motion` fits their motion")
     if len(people) < FEWEST:
         raise ValueError(f"{data.path}: {len(people)} training subjects, expected {FEWEST} or more")
     named = {s.label for s in data.sequences if s.subject in set(people.tolist()) and ">" not in s.label}

@@ -8,7 +8,7 @@ import pytest
 
 from experiments import _cases, _dense, _run, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
 from facejax import evaluation, fit_gpmm, methods
-from facejax.data import store
+from facejax.data import makehuman4d, store
 from facejax.data.meshes import of_split
 from tests.test_cli import recorded
 from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
@@ -92,6 +92,7 @@ def test_cases_share_nobody_or_no_expression(tiny_store):
         ("d3dfacs", 3, {f"e{i:02}" for i in range(11)}),
         ("bu3dfe", 10, {"angry", "disgust"}),
         ("florence4d", 40, {"e00", "e01"}),
+        ("coma", 3, {f"e{i:02}" for i in range(4)}),
     ],
 )
 def test_published_splits(tiny_store, name, identity, expression):
@@ -99,22 +100,30 @@ def test_published_splits(tiny_store, name, identity, expression):
     labels = (
         [f"e{i:02}" for i in range(14)] + ["angry", "disgust"] if name == "bu3dfe" else [f"e{i:02}" for i in range(14)]
     )
-    count = {"d3dfacs": 10, "bu3dfe": 20, "florence4d": 60}[name]
+    count = {"d3dfacs": 10, "bu3dfe": 20, "florence4d": 60, "coma": 12}[name]
     recordings = [store.Sequence(p, label, 0, 1, 0, 0, 0, 0, 0.1) for p in range(count) for label in labels]
-    people = [{"name": f"p{i}", "split": "train", "sex": "female" if i < 45 else "male"} for i in range(count)]
+    # Whom the dataset's own splits keep apart is among the paper's people all the same.
+    splits = [makehuman4d.split_of(i, count) for i in range(count)]
+    people = [
+        {"name": f"p{i}", "split": split, "sex": "female" if i < 45 else "male"} for i, split in enumerate(splits)
+    ]
     data = tiny_store._replace(
         index=tiny_store.index | {"name": name, "subjects": people},
         sequences=tuple(recordings),
         drawn=np.arange(len(recordings)),
         vertices=np.broadcast_to(tiny_store.vertices[:1], (len(recordings), *tiny_store.vertices.shape[1:])),
     )
-    (by_person,) = _cases.cases(data, ["identity"])
+    by_person, *more = _cases.cases(data, ["identity"])
+    assert len(more) == (3 if name == "coma" else 0)
     assert len(by_person.test.subjects) == identity
-    (by_label,) = _cases.cases(data, ["expression"])
+    by_label = _cases.cases(data, ["expression"])[0]
     assert set(by_label.test.labels) == expression and by_label.test.count + by_label.train.count == len(recordings)
     held = by_person.test.subjects
     if name == "florence4d":
         assert set(held) == {*range(15, 45), *range(50, 60)}
+        del people[2]["sex"]
+        with pytest.raises(ValueError, match="nothing says whether p2 is female or male"):
+            _cases.cases(data, ["identity"])
     else:
         assert set(held) == set(range(identity))
 

@@ -112,3 +112,11 @@ def open_store(path: Path) -> Store:
     except (KeyError, TypeError) as error:
         raise StoreError(f"{path / 'index.json'} lacks {error}: prepare the dataset anew") from error
     return Store(path, index, sequences, **arrays)
+
+
+def open_meshes(path: Path) -> Store:
+    """The same for what needs meshes. Raises `StoreError` for a dataset that holds landmarks alone, as BU-4DFE does."""
+    found = open_store(path)
+    if len(found.vertices) == 0:
+        raise StoreError(f"{path}: holds landmarks alone, expected meshes")
+    return found

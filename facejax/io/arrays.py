@@ -4,12 +4,25 @@ Functions raise plain ValueError, and what `zipfile` raises on damage; `facejax.
 """
 
 import math
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
+# What the readers, and the zip and array parsers below them, raise on damaged input.
+DAMAGE = (
+    ValueError,
+    LookupError,
+    EOFError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,

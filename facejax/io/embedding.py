@@ -28,7 +28,12 @@ _CONTOUR = ("dynamic_lmk_faces_idx", "dynamic_lmk_bary_coords")
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (L,) int64 and weights (L, 3) float64. Raises `ValueError` for a file that is no embedding."""
-    found = _entries(path)
+    try:
+        found = _entries(path)
+    except (pickles.PickleError, OSError):
+        raise
+    except arrays.DAMAGE as error:
+        raise ValueError(str(error)) from error
     names = next((pair for pair in _NAMES if all(name in found for name in pair)), None)
     if names is None:
         raise ValueError(f"is no landmark embedding: holds {sorted(map(str, found))[:8]}")

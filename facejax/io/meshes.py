@@ -9,9 +9,6 @@ import os
 import re
 import shutil
 import tempfile
-import tokenize
-import zipfile
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,19 +16,8 @@ import numpy as np
 
 from facejax import files
 from facejax.io import arrays, glb, ply
-from facejax.io.arrays import LIMIT
+from facejax.io.arrays import DAMAGE, LIMIT
 
-# What the readers, and the zip and array parsers below them, raise on damaged input.
-_DAMAGE = (
-    ValueError,
-    LookupError,
-    EOFError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 _FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
 
 
@@ -73,7 +59,7 @@ def read(path: str | os.PathLike) -> Mesh:
         raise MeshError(f"{path}: no such file") from None
     except OSError as error:
         raise MeshError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise MeshError(f"{path}: {error}") from error
     return _checked(path, vertices, faces)
 
@@ -198,7 +184,7 @@ def _told(path: Path, reader, *options):
         return reader(path, *options)
     except FileNotFoundError:
         raise MeshError(f"{path}: no such file") from None
-    except (OSError, *_DAMAGE) as error:
+    except (OSError, *DAMAGE) as error:
         raise MeshError(f"{path}: {error}") from error
 
 

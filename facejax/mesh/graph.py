@@ -115,3 +115,12 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
             after = follows.pop(after)
         loops.append(np.array(loop))
     return loops
+
+
+def on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
+    """Which of `count` vertices lie on an edge of one triangle alone, (count,) bool."""
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1).astype(np.int64)
+    found, times = np.unique(pairs[:, 0] * count + pairs[:, 1], return_counts=True)
+    mask = np.zeros(count, bool)
+    mask[np.concatenate(np.divmod(found[times == 1], count))] = True
+    return mask

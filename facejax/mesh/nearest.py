@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from facejax.mesh import graph, ops
+from facejax.mesh import graph
 
 CANDIDATES = 12  # triangles looked at for each point: those of the nearest samples
 FINE = 24_000  # samples of a surface at least: a large triangle gets several
@@ -45,9 +44,7 @@ def surface(vertices: np.ndarray, faces: np.ndarray, *, seed: int = 0) -> Surfac
     area = np.linalg.norm(doubled, axis=1) / 2
     if not area.sum() > 0:
         raise ValueError("the mesh has no area")
-    edge = np.zeros(len(vertices), bool)
-    for loop in graph.boundary_loops(faces):
-        edge[loop] = True
+    edge = graph.on_boundary(faces, len(vertices))
     rng = np.random.default_rng(seed)
     extra = rng.choice(len(faces), max(0, FINE - len(faces)), p=area / area.sum())
     owner = np.concatenate([np.arange(len(faces)), extra])
@@ -93,8 +90,14 @@ def query(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None,
 
 
 def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) float64 of vertices, by area; zero where there is none."""
-    return np.asarray(ops.vertex_normals(jnp.asarray(vertices, jnp.float32), jnp.asarray(faces)), np.float64)
+    """Unit normals (V, 3) float64 of vertices, by area; zero where there is none.
+
+    As `ops.vertex_normals`, without a compilation for every new mesh.
+    """
+    corners = np.asarray(vertices, np.float64)[faces]
+    doubled = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
+    total = np.stack([np.bincount(np.ravel(faces), axis, len(vertices)) for axis in doubled.T], axis=1)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
 
 
 def at(on: Surface, hits: Hits, values: np.ndarray) -> np.ndarray:

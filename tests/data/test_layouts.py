@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 
+from facejax import fit_models
 from facejax.data import cuts, ingest, layouts, motions, source, store, takes
 from tests.data import captures
 from tests.data.captures import CURVE, face, motion
@@ -114,6 +115,10 @@ def test_bu4dfe_has_landmarks_alone(tmp_path, tiny_store):
     assert data.index["rate"] == 25 and data.labels == ("neutral", "angry", "happy")
     halves = motions.halves(data, "train")
     assert halves.curves.shape == (8, 30, 83, 3)
+    with pytest.raises(store.StoreError, match="holds landmarks alone, expected meshes"):
+        store.open_meshes(data.path)
+    with pytest.raises(ValueError, match="holds landmarks alone"):
+        fit_models.check(data)
 
 
 def test_tables_beside_a_dataset(capture, marks, tiny_store):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from facejax.mesh import nearest
+from facejax.mesh import graph, nearest, ops
 
 BALL = trimesh.creation.icosphere(subdivisions=2)
 VERTICES, FACES = np.asarray(BALL.vertices), np.asarray(BALL.faces)
@@ -52,3 +52,16 @@ def test_the_far_side_of_a_hole_is_its_edge():
     on = nearest.surface(VERTICES, kept)
     hits = nearest.query(on, np.array([[0, 0, 1.0], [0, 0, -1.0]]))
     assert nearest.on_edge(on, hits).tolist() == [True, False]
+    loops = np.concatenate(graph.boundary_loops(kept))
+    assert (
+        np.flatnonzero(on.edge).tolist() == sorted(loops.tolist()) and not nearest.surface(VERTICES, FACES).edge.any()
+    )
+
+
+def test_normals_are_those_of_the_jitted_function():
+    rng = np.random.default_rng(2)
+    bent = VERTICES + 0.1 * rng.normal(size=VERTICES.shape)
+    expected = ops.vertex_normals(np.asarray(bent, np.float32), FACES)
+    np.testing.assert_allclose(nearest.normals(bent, FACES), expected, atol=1e-5)
+    lonely = nearest.normals(np.concatenate([bent, [[9, 9, 9.0]]]), FACES)
+    assert not lonely[-1].any()

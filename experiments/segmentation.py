@@ -1,0 +1,135 @@
+"""Where do expressions begin, peak and end? The cuts that are found by themselves, to be looked at.
+
+    python -m experiments.segmentation --data runs/scans
+
+Draws how far the landmarks are from rest in every recording, with its cuts: onset, apex, offset. Where one is wrong, a
+table of your own says better (`facejax data prepare --cuts`). On makehuman4d, whose performers are known to the frame,
+the cuts found are held against theirs: `--publish` writes that.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from experiments import _cases, _run
+from facejax.data import cuts, store
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+COLUMNS, PANELS = 6, 60
+COLOURS = {"onset": "#5b8db8", "apex_start": "#c46b4e", "apex_end": "#c46b4e", "offset": "#6a9a58"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    out: Path = Path("runs/segmentation")
+    """Folder for the results."""
+    data: Path | None = None
+    """A prepared dataset in place of makehuman4d."""
+    level: int = 3
+    """Realism of makehuman4d."""
+    panels: int = PANELS
+    """How many recordings are drawn, evenly from all."""
+    seed: int = 0
+    """For the record."""
+    quick: bool = False
+    """A small dataset."""
+    publish: bool = False
+    """Also write the figures that the README quotes."""
+
+
+def run(config: Config) -> dict[str, Any]:
+    """The errors of the cuts by kind, on makehuman4d; of other data how many recordings each label has."""
+    if config.panels < 1:
+        raise ValueError(f"panels: expected 1 or more, got {config.panels}")
+    begun = time.perf_counter()
+    data = _cases.data_of(config.data, "quick" if config.quick else "default", level=config.level)
+    known = _cases.is_makehuman(data)
+    takes = [take for take in data.sequences if ">" not in take.label]
+    found = [cuts.find(*_curve(data, take)) for take in takes] if known else [cuts.Cuts(*take[4:8]) for take in takes]
+    metrics: dict[str, Any] = {"recordings": len(takes), "labels": _counts(takes)}
+    if known:
+        metrics["errors"] = _errors(takes, found)
+    config.out.mkdir(parents=True, exist_ok=True)
+    figure = _plot(config.out / "segmentation.png", data, takes, found, known, config.panels)
+    made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
+    _run.finish("segmentation", config, metrics, made=made, table=_table(metrics), figure=figure)
+    return metrics
+
+
+def _curve(data: store.Store, take: store.Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks (T, L, 3) of a recording, and those at rest (L, 3)."""
+    curve = np.asarray(data.landmarks[take.start : take.start + take.frames])
+    return curve, data.neutral[take.subject][data.landmark_index]
+
+
+def _counts(takes: list[store.Sequence]) -> dict[str, int]:
+    labels, counts = np.unique([take.label for take in takes], return_counts=True)
+    return dict(zip(labels.tolist(), counts.tolist(), strict=True))
+
+
+def _errors(takes: list[store.Sequence], found: list[cuts.Cuts]) -> list[dict[str, Any]]:
+    """Frames between the cuts found and the performers' own."""
+    off = np.array(found) - np.array([take[4:8] for take in takes])
+    return [
+        {
+            "cut": name,
+            "mean_frames": float(np.abs(off[:, i]).mean()),
+            "bias_frames": float(off[:, i].mean()),
+            "within_3": float(np.mean(np.abs(off[:, i]) <= 3)),
+            "worst_frames": int(np.abs(off[:, i]).max()),
+        }
+        for i, name in enumerate(cuts.Cuts._fields)
+    ]
+
+
+def _table(metrics: dict[str, Any]) -> str:
+    if "errors" not in metrics:
+        return _run.markdown(["label", "recordings"], list(metrics["labels"].items()))
+    header = ["cut", "off by, frames", "of that later", "within 3 frames", "worst"]
+    body = [
+        [
+            row["cut"].replace("_", " "), f"{row['mean_frames']:.1f}", f"{row['bias_frames']:+.1f}",
+            f"{row['within_3']:.0%}", row["worst_frames"],
+        ]
+        for row in metrics["errors"]
+    ]  # fmt: skip
+    return f"{metrics['recordings']} recordings:\n\n{_run.markdown(header, body)}"
+
+
+def _plot(path: Path, data: store.Store, takes, found, known: bool, panels: int) -> Path:
+    chosen = np.unique(np.linspace(0, len(takes) - 1, min(panels, len(takes))).round().astype(int))
+    lines = -(-len(chosen) // COLUMNS)
+    figure, axes = plt.subplots(
+        lines, COLUMNS, figsize=(2.6 * COLUMNS, 1.7 * lines), constrained_layout=True, squeeze=False
+    )
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for axis, i in zip(axes.ravel(), chosen, strict=False):
+        take, moved = takes[i], cuts.energy(*_curve(data, takes[i]))
+        axis.set_axis_on()
+        axis.plot(moved, color="0.3", lw=1)
+        for (name, colour), at in zip(COLOURS.items(), found[i], strict=True):
+            axis.axvline(at, color=colour, lw=1.2, label=name)
+        for at in take[4:8] if known else ():
+            axis.plot([at], [0], "^", color="0.2", ms=4, clip_on=False)
+        name = take.name or f"{data.index['subjects'][take.subject].get('name', take.subject)}/{take.label}"
+        axis.set_title(name, fontsize=7)
+        axis.tick_params(labelsize=6)
+        axis.set_ylim(0)
+    figure.supylabel("mm from rest, mean of the landmarks", fontsize=8)
+    figure.supxlabel("frame; lines: onset, apex, offset" + ("; triangles: the performer's own" * known), fontsize=8)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+    return path
+
+
+if __name__ == "__main__":
+    _run.main("segmentation", Config, run)
