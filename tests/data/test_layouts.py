@@ -312,6 +312,34 @@ def test_the_same_bytes_by_any_number_of_processes_and_after_kills(capture, mark
     assert _bytes(again) == _bytes(whole) and not (tmp_path / ".killed.part").exists()
 
 
+@pytest.mark.slow
+def test_ten_kills_at_random_moments(tmp_path, marks, tiny_store):
+    root, rng = tmp_path / "coma", np.random.default_rng(0)
+    for _ in range(6):  # recordings enough that a kill falls into the reading
+        captures.coma(tmp_path / "one", tiny_store)
+        for person in (tmp_path / "one").iterdir():
+            for take in person.iterdir():
+                number = "abcdef"[len(list((root / person.name).glob("*"))) // 3]
+                (root / person.name).mkdir(parents=True, exist_ok=True)
+                take.rename(root / person.name / f"{take.name}_{number}")
+            person.rmdir()
+        (tmp_path / "one").rmdir()
+    whole = prepared(root, marks, out="whole")
+    command = [sys.executable, "-m", "facejax.cli", "data", "prepare", "coma", "--root", root, "--landmarks", marks]
+    killed = 0
+    for _ in range(10):
+        with subprocess.Popen([*command, "--out", tmp_path / "killed", "--workers", "2"]) as process:
+            time.sleep(rng.uniform(0.5, 4))
+            process.send_signal(signal.SIGKILL)
+            killed += process.wait() == -signal.SIGKILL
+        if (tmp_path / "killed").exists():
+            break
+    assert killed
+    if not (tmp_path / "killed").exists():
+        prepared(root, marks, out="killed")
+    assert _bytes(store.open_store(tmp_path / "killed")) == _bytes(whole)
+
+
 def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_path, monkeypatch):
     root = capture("coma")
     real, seen = takes.do, []
