@@ -33,19 +33,20 @@ def main(arguments: list[str] | None = None) -> None:
 def _generate(command: Generate) -> None:
     from facejax import produce
 
+    worn = None
     if command.landmarks is None:
-        face, notes = produce.neutral_face(command.face, command.model)
-        generate = produce.generate
+        neutral, notes = produce.neutral_face(command.face, command.model)
     elif command.face is None:
         raise ValueError(f"--landmarks {command.landmarks}: of which scan? name it with --face")
     else:
         from facejax import scanned
 
-        face = scanned.read(command.face, command.landmarks)
-        notes, generate = face.notes, scanned.generate
+        scan = scanned.read(command.face, command.landmarks)
+        worn, notes = scanned.wear(scan), scan.notes
+        neutral = worn.neutral
     labels = (command.start, command.end, *command.then)
-    done = generate(
-        face, labels, command.out, model=command.model, seed=command.seed, samples=command.samples,
+    done = produce.generate(
+        neutral, labels, command.out, worn=worn, model=command.model, seed=command.seed, samples=command.samples,
         frames=command.frames, fps=command.fps, intensity=command.intensity, formats=command.formats,
     )  # fmt: skip
     _said((done, tuple(f"{command.face}: {note}" for note in notes)))

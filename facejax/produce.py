@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import animation, drive, files, io, pipeline, results
+from facejax import animation, drive, files, io, pipeline, results, scanned
 from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait, store
 from facejax.io import dress, faces
 
@@ -18,6 +18,7 @@ def generate(
     labels: Sequence[str],
     out: Path,
     *,
+    worn: scanned.Worn | None = None,
     model: Path | None = None,
     seed: int = 7,
     samples: int = 1,
@@ -28,11 +29,14 @@ def generate(
 ) -> list[Path]:
     """Animate a neutral face (N, 3) through labels, and write every sample in every format. Returns the files.
 
-    `frames` as in `pipeline.landmarks`, or "natural": as long as people take, generated with the first sample.
+    `frames` as in `pipeline.landmarks`, or "natural": as long as people take, generated with the first sample. What is
+    `worn` on this neutral face, a scan, is what moves.
     """
     results.compile_cache()
     models = pipeline.load(model)
     pipeline.label_indices(models, labels)
+    if worn is not None and not np.array_equal(models.face.faces, assets.load().faces):
+        raise ValueError(f"{model}: is in another topology than MakeHuman's, which scans are registered to")
     results.check_formats(formats)
     results.check_rate(fps)
     if frames == drive.NATURAL:
@@ -41,18 +45,19 @@ def generate(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )
     results.writable(out)
-    written = []
+    written, name = [], results.stem(labels) if worn is None else f"{worn.name}-{results.stem(labels)}"
     with results.progress("writing", samples * len(formats) + 1) as advance:
         for i, marks in enumerate(np.asarray(landmarks)):
             vertices = np.asarray(pipeline.meshes(models, marks, neutral))
-            stem = results.stem(labels) if samples == 1 else f"{results.stem(labels)}-{i + 1}"
-            scene = results.scene_of(models, neutral, vertices, marks, labels, frames)
+            stem = name if samples == 1 else f"{name}-{i + 1}"
+            if worn is None:
+                scene = results.scene_of(models, neutral, vertices, marks, labels, frames)
+            else:
+                scene = scanned.scene_of(models, worn, vertices, marks, labels, frames)
             for suffix in formats:
                 written.append(results.save(out, stem, suffix, scene, fps))
                 advance()
-        written.append(
-            results.save_landmarks(out / f"{results.stem(labels)}-landmarks.npz", landmarks, labels, frames, fps)
-        )
+        written.append(results.save_landmarks(out / f"{name}-landmarks.npz", landmarks, labels, frames, fps))
         advance()
     return written
 

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from facejax import animation, drive, files, io, pipeline, register, results, schemes
+from facejax import animation, files, io, pipeline, register, results, schemes
 from facejax.data import makehuman
 from facejax.io import dress, faces, render
 from facejax.io.meshes import MeshError
@@ -42,6 +40,16 @@ class Scan(NamedTuple):
     which: np.ndarray  # (L,) of the 68
     unit: float  # millimetres of the file's unit
     notes: tuple[str, ...]
+
+
+class Worn(NamedTuple):
+    """A scan that moves with the template; millimetres, y up, z forward."""
+
+    name: str
+    neutral: np.ndarray  # (N, 3) float32, the template on the scan
+    still: np.ndarray  # (V, 3) float32
+    faces: np.ndarray  # (F, 3)
+    hung: register.Carrier
 
 
 @functools.cache
@@ -135,53 +143,20 @@ def pictures(scan: Scan, found: register.Registration) -> list[np.ndarray]:
     ]
 
 
-def generate(
-    scan: Scan,
-    labels: Sequence[str],
-    out: Path,
-    *,
-    model: Path | None = None,
-    seed: int = 7,
-    samples: int = 1,
-    frames: int | Sequence[int] | str = pipeline.FRAMES,
-    fps: float = 30.0,
-    intensity: float = 1.0,
-    formats: Sequence[str] = ("glb", "html", "webp"),
-) -> list[Path]:
-    """Animate a scan's own vertices through labels; as `produce.generate`. Millimetres, y up, z forward."""
-    results.compile_cache()
-    models = pipeline.load(model)
-    pipeline.label_indices(models, labels)
-    results.check_formats(formats)
-    results.check_rate(fps)
-    found, template = fit(scan), people()
-    if not np.array_equal(models.face.faces, template.faces):
-        raise ValueError(f"{model}: is in another topology than MakeHuman's, which scans are registered to")
-    if frames == drive.NATURAL:
-        frames = pipeline.durations(models, jax.random.key(seed), labels, rate=fps)
+def wear(scan: Scan) -> Worn:
+    """Register a scan, and hang it on the template; in the template's frame: y up, z forward."""
+    found, faces_ = fit(scan), people().faces
     neutral, still = ((x @ found.turn.T + found.move).astype(np.float32) for x in (found.vertices, scan.vertices))
-    hung = register.carrier(neutral, template.faces, still, scan.faces)
-    landmarks = np.asarray(
-        pipeline.landmarks(
-            models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
-        )
-    )
-    results.writable(out)
-    written, captions = [], pipeline.captions(labels, frames=frames)
-    rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
-    with results.progress("writing", samples * len(formats) + 1) as advance:
-        for i, marks in enumerate(landmarks):
-            moved = still + register.carry(hung, np.asarray(pipeline.meshes(models, marks, neutral)) - neutral)
-            extras = dress.parts(models.props, rest, marks) if dress.has_eye_holes(still, scan.faces, rest) else ()
-            shot = io.scene.make(moved, scan.faces, captions=captions, landmarks=marks, extras=extras)
-            stem = f"{scan.name}-{results.stem(labels)}" + (f"-{i + 1}" if samples > 1 else "")
-            for suffix in formats:
-                written.append(results.save(out, stem, suffix, shot, fps))
-                advance()
-        path = out / f"{scan.name}-{results.stem(labels)}-landmarks.npz"
-        written.append(results.save_landmarks(path, landmarks, labels, frames, fps))
-        advance()
-    return written
+    return Worn(scan.name, neutral, still, scan.faces, register.carrier(neutral, faces_, still, scan.faces))
+
+
+def scene_of(models: pipeline.Models, worn: Worn, vertices: np.ndarray, marks: np.ndarray, labels, frames):
+    """`results.scene_of` in the scan's own vertices: of the template's (T, N, 3) and landmarks (T, L, 3)."""
+    rest = np.asarray(pipeline.neutral_landmarks(models, worn.neutral))
+    moved = worn.still + register.carry(worn.hung, vertices - worn.neutral)
+    extras = dress.parts(models.props, rest, marks) if dress.has_eye_holes(worn.still, worn.faces, rest) else ()
+    captions = pipeline.captions(labels, frames=frames)
+    return io.scene.make(moved, worn.faces, captions=captions, landmarks=marks, extras=extras)
 
 
 def _known(found: io.landmarks.Landmarks, path: Path) -> tuple[np.ndarray, np.ndarray]:
