@@ -8,13 +8,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from facejax.data import cache, makehuman, makehuman4d, performance, store
+from facejax.data import cache, layouts, makehuman, makehuman4d, performance, store
 from facejax.data.meshes import Meshes, of_split
 from facejax.mesh import attachment, topology
 
 MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
 FOLDS = 4
-SEXES = ("female", "male")
 QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
 Mode = Literal["quick", "default", "paper"]
 
@@ -107,7 +106,7 @@ def _florence(people: Meshes, split: str) -> list[Case]:
     if split == "expression":
         return _one_fold(people, split, _first_of_each(people, 2))
     sex = np.array([people.data.index["subjects"][i].get("sex", "") for i in people.subjects])
-    if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, SEXES)]]:
+    if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, layouts.SEXES)]]:
         raise ValueError(
             f"{people.data.path}: nothing says whether {unknown[0]} is female or male, by which Florence 4D is split: "
             "prepare it with --people"

@@ -2,9 +2,9 @@
 
     python -m experiments.segmentation --data runs/scans
 
-Draws how far the landmarks are from rest in every recording, with its cuts: onset, apex, offset. Where one is wrong, a
-table of your own says better (`facejax data prepare --cuts`). On makehuman4d, whose performers are known to the frame,
-the cuts found are held against theirs: `--publish` writes that.
+Draws how far the landmarks are from rest in every recording, with its cuts: onset, apex, offset. Where one is wrong,
+correct it in `cuts.csv`, which lies beside the picture, and prepare the data with it (`facejax data prepare --cuts`).
+On makehuman4d, whose performers are known to the frame, the cuts found are held against theirs: that is published.
 """
 
 from __future__ import annotations
@@ -59,6 +59,7 @@ def run(config: Config) -> dict[str, Any]:
         metrics["errors"] = _errors(takes, found)
     config.out.mkdir(parents=True, exist_ok=True)
     figure = _plot(config.out / "segmentation.png", data, takes, found, known, config.panels)
+    _run.write_text(config.out / "cuts.csv", _csv(data, takes, found))
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("segmentation", config, metrics, made=made, table=_table(metrics), figure=figure)
     return metrics
@@ -68,6 +69,15 @@ def _curve(data: store.Store, take: store.Sequence) -> tuple[np.ndarray, np.ndar
     """Landmarks (T, L, 3) of a recording, and those at rest (L, 3)."""
     curve = np.asarray(data.landmarks[take.start : take.start + take.frames])
     return curve, data.neutral[take.subject][data.landmark_index]
+
+
+def _csv(data: store.Store, takes, found) -> str:
+    """The cuts as `facejax data prepare --cuts` reads them."""
+    rows = ["subject,recording," + ",".join(cuts.Cuts._fields)]
+    for take, cut in zip(takes, found, strict=True):
+        name = take.name.rpartition("/")[2] or take.label
+        rows.append(f"{data.index['subjects'][take.subject]['name']},{name}," + ",".join(map(str, cut)))
+    return "\n".join(rows) + "\n"
 
 
 def _counts(takes: list[store.Sequence]) -> dict[str, int]:
@@ -108,7 +118,7 @@ def _plot(path: Path, data: store.Store, takes, found, known: bool, panels: int)
     chosen = np.unique(np.linspace(0, len(takes) - 1, min(panels, len(takes))).round().astype(int))
     lines = -(-len(chosen) // COLUMNS)
     figure, axes = plt.subplots(
-        lines, COLUMNS, figsize=(2.6 * COLUMNS, 1.7 * lines), constrained_layout=True, squeeze=False
+        lines, COLUMNS, figsize=(2.6 * COLUMNS, max(3.4, 1.7 * lines)), constrained_layout=True, squeeze=False
     )
     for axis in axes.ravel():
         axis.set_axis_off()

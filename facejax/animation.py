@@ -24,8 +24,6 @@ from facejax.io import faces
 from facejax.io.meshes import MeshError
 from facejax.mesh import attachment, graph
 
-ALIKE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
-
 
 class Face(NamedTuple):
     """A mesh that is ready to be moved; millimetres, its own pose but y up and z forward."""
@@ -65,7 +63,7 @@ def prepare(
         shared = schemes.common(len(template), len(landmarks))
         points, wanted = landmarks[shared[1]], np.asarray(template, np.float64)[shared[0]]
         attachment.check(landmarks, vertices)
-        rotation, size = place(points, wanted)
+        rotation, size = faces.place(points, wanted)
         weights, loose = _weights(vertices, triangles, points, shared[0], len(template), pin, options)
     except ValueError as error:
         raise MeshError(f"{name}: {error}") from error
@@ -119,24 +117,6 @@ def landmarks_of(face: Face, curve: np.ndarray | jax.Array, *, intensity: float 
         raise ValueError(f"curve: expected (..., T, L, 3) with L of {least} or more, got {np.shape(curve)}")
     check_intensity(intensity)
     return _at_rest(face) + intensity * face.size * jnp.asarray(curve)[..., face.shared[0], :] @ face.rotation.T
-
-
-def place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rotation (3, 3) from the template's landmarks (C, 3) to a mesh's, and the mesh's size against the template's.
-
-    Raises `ValueError` where the two are not alike.
-    """
-    spread, wanted = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (points, template))
-    shapes = ((p - p.mean(axis=0)) / s for p, s in ((points, spread), (template, wanted)))
-    shape, target = (s.astype(np.float32) for s in shapes)
-    fit = align.procrustes(target, shape, scaling=True)
-    off = float(np.linalg.norm(np.asarray(align.apply(fit, target)) - shape))
-    if off > ALIKE:
-        raise ValueError(
-            f"its {len(points)} landmarks do not form a face (distance {off:.2f} of at most {ALIKE}): are they "
-            "in the order of the scheme, left and right as the subject has them?"
-        )
-    return np.asarray(fit.rotation, np.float64), spread / wanted
 
 
 def check_intensity(intensity: float) -> None:

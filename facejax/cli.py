@@ -41,8 +41,7 @@ def _generate(command: Generate) -> None:
     else:
         from facejax import scanned
 
-        scan = scanned.read(command.face, command.landmarks)
-        worn, notes = scanned.wear(scan), scan.notes
+        worn, notes = scanned.wear(scanned.read(command.face, command.landmarks))
         neutral = worn.neutral
     labels = (command.start, command.end, *command.then)
     done = produce.generate(

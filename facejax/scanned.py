@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import animation, files, io, pipeline, register, results, schemes
+from facejax import files, io, pipeline, register, results, schemes
 from facejax.data import makehuman
 from facejax.io import dress, faces, render
 from facejax.io.meshes import MeshError
@@ -24,7 +24,8 @@ SEVEN = (
     "nose tip", "right lip corner", "left lip corner",
 )  # fmt: skip
 PEOPLE, PEOPLE_SEED = 400, 2**16  # of a population that no experiment uses
-LEAST = 3
+LEAST = 4
+UNLIKE, COVERED, APART, OFF = 4.0, 0.7, 0.5, 3.0  # beyond which there is something to say of a fit
 PICTURE = (360, 440)
 RED = 2.0  # mm, where a picture of distances is darkest
 SHOWN = ("scan", "template", f"distance, dark at {RED:g} mm")
@@ -69,18 +70,20 @@ def read(path: Path, landmarks: Path) -> Scan:
     if mesh.faces is None:
         raise MeshError(f"{path}: has no triangles, nothing to register")
     found = io.landmarks.read(landmarks, mesh.vertices, mesh.faces)
-    which, kept = _known(found, landmarks)
+    which, kept, passed = _known(found, landmarks)
     points = found.points[kept]
     template = makehuman.template()
     wanted = template.vertices[template.landmarks[which]]
     try:
-        _, size = animation.place(points, wanted)
+        _, size = faces.place(points, wanted)
     except ValueError as error:
         raise MeshError(f"{path}: {error}") from error
     unit, name = faces.unit_of(size, str(path))
     notes = [f"read as {name}"]
     if len(which) < 68:
         notes.append(f"{len(which)} of 68 landmarks are given, the others are estimated")
+    if passed:
+        notes.append(f"no landmarks' names, passed over: {', '.join(passed)}")
     return Scan(path.stem, mesh.vertices * unit, mesh.faces, points * unit, which, unit, tuple(notes))
 
 
@@ -110,24 +113,37 @@ def save(scan: Scan, found: register.Registration, out: Path) -> tuple[list[Path
     paths = [out / f"{scan.name}-{what}" for what in ("template.ply", "landmarks.json", "fit.json", "fit.png")]
     io.save(paths[0], found.vertices / scan.unit, model.faces)
     io.landmarks.write(paths[1], points=hits.points / scan.unit, names=schemes.by_count(68).points)
+    record = measured(scan, found)
+    with files.replacing(paths[2]) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n")
+    render.save(paths[3], render.contact_sheet([pictures(scan, found)], column_labels=SHOWN))
+    return paths, scan.notes + remarks(record)
+
+
+def measured(scan: Scan, found: register.Registration) -> dict[str, float]:
+    """How well the template lies on a scan: distances in mm, the share of it that is matched, how unusual the face."""
     distance = found.distance[found.matched]
-    record = {
+    off = np.linalg.norm(found.vertices[people().landmark_index[scan.which]] - scan.landmarks, axis=1)
+    return {
         "mean_mm": float(distance.mean()),
         "percentile95_mm": float(np.percentile(distance, 95)),
         "matched": float(found.matched.mean()),
         "largest_coefficient": float(np.abs(found.coefficients).max()),
         "landmarks_given": len(scan.which),
+        "landmarks_mm": float(off.mean()),
     }
-    with files.replacing(paths[2]) as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
-    render.save(paths[3], render.contact_sheet([pictures(scan, found)], column_labels=SHOWN))
-    notes = list(scan.notes)
-    notes.append(
-        f"{record['mean_mm']:.2f} mm from the scan in the mean, over the {record['matched']:.0%} that it covers"
-    )
-    if record["largest_coefficient"] > 4:
-        notes.append("the face is unlike any of the people that the template knows: look at the picture")
-    return paths, tuple(notes)
+
+
+def remarks(record: dict[str, float]) -> tuple[str, ...]:
+    """What to say of a registration."""
+    notes = [f"{record['mean_mm']:.2f} mm from the scan in the mean, over the {record['matched']:.0%} that it covers"]
+    if record["matched"] < COVERED:
+        notes.append("the rest of the head is a guess: the scan has no surface there")
+    if record["largest_coefficient"] > UNLIKE or record["mean_mm"] > APART:
+        notes.append("this is unlike any head that the template knows: look at the picture of `facejax register`")
+    if record["landmarks_mm"] > OFF:
+        notes.append(f"the landmarks lie {record['landmarks_mm']:.1f} mm off in the mean: are they of this face?")
+    return tuple(notes)
 
 
 def pictures(scan: Scan, found: register.Registration) -> list[np.ndarray]:
@@ -143,11 +159,12 @@ def pictures(scan: Scan, found: register.Registration) -> list[np.ndarray]:
     ]
 
 
-def wear(scan: Scan) -> Worn:
-    """Register a scan, and hang it on the template; in the template's frame: y up, z forward."""
+def wear(scan: Scan) -> tuple[Worn, tuple[str, ...]]:
+    """Register a scan, and hang it on the template, y up and z forward; and what there is to say of it."""
     found, faces_ = fit(scan), people().faces
     neutral, still = ((x @ found.turn.T + found.move).astype(np.float32) for x in (found.vertices, scan.vertices))
-    return Worn(scan.name, neutral, still, scan.faces, register.carrier(neutral, faces_, still, scan.faces))
+    hung = register.carrier(neutral, faces_, still, scan.faces)
+    return Worn(scan.name, neutral, still, scan.faces, hung), scan.notes + remarks(measured(scan, found))
 
 
 def scene_of(models: pipeline.Models, worn: Worn, vertices: np.ndarray, marks: np.ndarray, labels, frames):
@@ -159,8 +176,8 @@ def scene_of(models: pipeline.Models, worn: Worn, vertices: np.ndarray, marks: n
     return io.scene.make(moved, worn.faces, captions=captions, landmarks=marks, extras=extras)
 
 
-def _known(found: io.landmarks.Landmarks, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) of the 68 that are known, and (K,) which of the file's each is."""
+def _known(found: io.landmarks.Landmarks, path: Path) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """(K,) of the 68 that are known, (K,) which of the file's each is, and names that are unknown."""
     names, count = schemes.by_count(68).points, len(found.points)
     given = found.names if found.names is not None and set(found.names) & set(names) else None
     if given is None and count == len(SEVEN):
@@ -179,4 +196,5 @@ def _known(found: io.landmarks.Landmarks, path: Path) -> tuple[np.ndarray, np.nd
             ) from error
     if len(which) < LEAST:
         raise io.landmarks.LandmarkError(f"{path}: {len(which)} landmarks are known, expected {LEAST} or more")
-    return which, kept
+    passed = [name for name in found.names or () if name not in names] if given is found.names else []
+    return which, kept, passed

@@ -194,7 +194,7 @@ def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
     (root / "S1" / "big smile" / "000004.ply").write_bytes(b"ply")
     assert "big smile/000004.ply" in told("--landmarks", marks, "--unit", "m")
     (root / "S1" / "big smile" / "000004.ply").unlink()
-    assert "big smile: frame 4 is missing, after 000003.ply; allow gaps" in told("--landmarks", marks)
+    assert "big smile: frame 4 is missing, after 000003.ply; --gaps takes" in told("--landmarks", marks)
     assert "folder: has no --template" in told("--landmarks", marks, "--template", marks)
     assert {path.name for path in tmp_path.iterdir()} == {"root", "marks.json"}
 

@@ -163,11 +163,28 @@ def test_bad_scans_get_one_line(files, tmp_path, capsys, head):
     io.landmarks.write(tmp_path / "named.json", points=points[[4, 5, 0, 6, 1]], names=names)
     with pytest.raises(MeshError, match="do not form a face"):  # the corner of an eye is no chin
         scanned.read(scan, tmp_path / "named.json")
+    io.landmarks.write(tmp_path / "three.json", points=points[4:], names=["nose tip", *scanned.SEVEN[5:]])
+    with pytest.raises(LandmarkError, match="3 landmarks are known, expected 4 or more"):
+        scanned.read(scan, tmp_path / "three.json")
+    wrong = [*scanned.SEVEN[:6], "left mouth corner"]
+    io.landmarks.write(tmp_path / "wrong.json", points=points, names=wrong)
+    assert "no landmarks' names, passed over: left mouth corner" in scanned.read(scan, tmp_path / "wrong.json").notes
     io.landmarks.write(tmp_path / "twice.json", points=points[:3], names=["nose tip", "nose tip", "chin"])
     with pytest.raises(LandmarkError, match="a landmark's name comes twice"):
         scanned.read(scan, tmp_path / "twice.json")
     np.save(tmp_path / "bare.npy", head[1])
     assert "has no triangles, nothing to register" in told("register", tmp_path / "bare.npy", "--landmarks", marks)
+
+
+def test_what_there_is_to_say_of_a_fit(head):
+    true, vertices, faces = head
+    front = faces[vertices[faces].mean(axis=1)[:, 2] > np.quantile(vertices[:, 2], 0.6)]
+    half = scan_of((true, vertices, front), registration.SEVEN)
+    said = scanned.remarks(scanned.measured(half, scanned.fit(half)))
+    assert "the rest of the head is a guess: the scan has no surface there" in said
+    off = scan_of(head, registration.SEVEN)
+    off = off._replace(landmarks=off.landmarks + np.where(np.arange(7) % 2, 1, -1)[:, None] * [0, 0, 8.0])
+    assert any("are they of this face?" in note for note in scanned.wear(off)[1])
 
 
 def test_the_experiment(tmp_path):

@@ -35,21 +35,25 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
     notes, takes, neutral = [], [], []
     if left := [name for name in names if name not in kept]:
         notes.append(f"{len(left)} of {len(names)} people have no neutral mesh and are left out: {source.some(left)}")
-    missing = []
+    missing, absent = [], []
     for subject, name in enumerate(kept):
         rest = next(path for key, path in sorted(found.items()) if key[:2] == (name, "NE"))
         neutral.append(rest)
         for code, label in EMOTIONS.items():
             levels = {key[2]: path for key, path in sorted(found.items()) if key[:2] == (name, code)}
-            missing += [f"{name}_{code}{level:02d}" for level in range(1, 5) if level not in levels]
-            if levels:
+            if not levels:
+                absent.append(f"{name}/{label}")
+            else:
+                missing += [f"{name}_{code}{level:02d}" for level in range(1, 5) if level not in levels]
                 frames = (rest, *levels.values())
                 last = len(frames) - 1
                 takes.append(
                     Take(subject, label, f"{name}/{label}", rest.parent, frames, len(frames), (0, last, last, last))
                 )
     if missing:
-        notes.append(f"{len(missing)} meshes are missing: {source.some(missing)}")
+        notes.append(f"{len(missing)} strengths are missing, their emotions have fewer frames: {source.some(missing)}")
+    if absent:
+        notes.append(f"{len(absent)} emotions are missing: {source.some(absent)}")
     if not takes:
         raise SourceError(f"{root}: holds neutral meshes alone, expected emotions (F0001_AN01WH_F3D)")
     return Source(

@@ -54,6 +54,15 @@ def restless(curve: np.ndarray, rest: np.ndarray, cuts: Cuts) -> tuple[bool, boo
     return tuple(bool(moved[frame] >= REST * moved.max()) for frame in (cuts.onset, cuts.offset))
 
 
+def visits(curve: np.ndarray, rest: np.ndarray) -> int:
+    """How often landmarks (T, L, 3) go more than half of their farthest way from rest (L, 3), and come home between."""
+    moved = energy(curve, rest)
+    far, home = moved > 0.5 * moved.max(), moved < 2 * REST * moved.max()
+    known = np.where(far, 1, np.where(home, 0, -1))
+    known = known[known >= 0]
+    return int(known[0] == 1) + int(np.sum(np.diff(known) == 1))
+
+
 def jumps(curve: np.ndarray) -> list[int]:
     """Frames that landmarks (T, L, 3) jump to: by ten times the usual step, and by two millimetres in the mean."""
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=-1).mean(axis=-1)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from facejax import files
+from facejax import files, schemes
 from facejax.data import cuts, makehuman4d, source, store, takes
 from facejax.data.source import Source, SourceError
 from facejax.io import faces, landmarks, meshes
@@ -26,9 +26,9 @@ from facejax.io import faces, landmarks, meshes
 VERSION = 1
 SEED = 1
 UNITS = {"mm": "millimetres", "cm": "centimetres", "m": "metres"}
-SPREAD = 446.2  # mm, the norm of MakeHuman's 68 centred landmarks; a constant, since the head itself is a download
 SPREADS = (0.5, 2.0)  # of it: what a named unit may make of 68 landmarks
 SIZES = (40.0, 5000.0)  # mm, of a whole mesh: a face, or all of a person
+OFF = 0.05  # of the mesh's size, that a landmark may lie off its surface
 LEAST = 4  # landmarks: fewer span no space
 MOST = 20_000  # meshes that are stored
 Progress = Callable[[int, int], None]
@@ -68,6 +68,8 @@ def prepare(
     """
     out, progress = Path(out), progress or (lambda done, total: None)
     check_request(recordings, out, request)
+    if workers is not None and workers < 1:
+        raise SourceError(f"workers: expected 1 or more, got {workers}")
     job, notes = _job(recordings, out, request)
     part = out.absolute().parent / f".{out.name}.part"
     try:
@@ -89,7 +91,9 @@ def check_request(recordings: Source, out: Path, request: Request) -> None:
     if not 0 < recordings.rate <= 1000:
         raise SourceError(f"rate: expected frames per second above 0, up to 1000, got {recordings.rate}")
     if request.most < 1:
-        raise SourceError(f"most: expected 1 mesh or more, got {request.most}")
+        raise SourceError(f"most (--meshes): expected 1 mesh or more, got {request.most}")
+    if recordings.landmarks_only and request.landmarks is not None:
+        raise SourceError(f"{recordings.layout}: has no --landmarks, its frames are landmarks themselves")
     if request.landmarks is None and recordings.landmarks is None:
         raise SourceError(f"{recordings.layout}: its meshes need a file of landmarks")
     if os.path.lexists(out):
@@ -113,6 +117,7 @@ def _job(found: Source, out: Path, request: Request) -> tuple[takes.Job, list[st
         )
     if shared_by := len(index) - len(np.unique(index)):
         notes.append(f"{request.landmarks}: {shared_by} of {len(index)} landmarks share a vertex with another")
+    notes += _faceless(shared.vertices[index], request.landmarks)
     neutral = np.stack([takes.millimetres(source.neutral(found, i, shared), scale) for i in range(len(found.people))])
     starts = np.cumsum([0, *(take.count for take in found.takes)])
     most = 0 if found.landmarks_only else request.most
@@ -194,7 +199,7 @@ def _finish(job: takes.Job, notes: list[str], folder: Path) -> None:
         "hashes": {name: files.sha256(folder / f"{name}.npy") for name in shapes},
         "subjects": [{"name": who.name, "split": split} | who.about for who, split in zip(people, splits, strict=True)],
         "sequences": [sequence._asdict() for sequence in sequences],
-        "notes": notes + takes.notes(job, said) + _lacking(splits) + list(found.notes),
+        "notes": notes + takes.notes(job, said) + _lacking(people, splits) + list(found.notes),
     }
     (folder / "index.json").write_text(json.dumps(index))
 
@@ -212,13 +217,34 @@ def _landmarks(path: Path | None, found: Source, shared: source.Common) -> tuple
     if marks.index is not None:
         return marks.index.astype(np.int32), None
     distance, nearest = cKDTree(shared.vertices).query(marks.points)
+    if distance.max() > OFF * source.size(shared.vertices):
+        worst = int(np.argmax(distance))
+        raise SourceError(
+            f"{path}: landmark {worst} lies {distance[worst]:.3g} off {shared.name}, which is "
+            f"{source.size(shared.vertices):.3g} in size: another unit, or another mesh?"
+        )
     return nearest.astype(np.int32), float(distance.max())
+
+
+def _faceless(points: np.ndarray, path: Path | None) -> list[str]:
+    """What to say of landmarks of a known scheme that do not look like a face."""
+    known = faces.template68()
+    try:
+        there, here = schemes.common(len(known), len(points))
+    except ValueError:
+        return []
+    try:
+        faces.place(points[here], known[there])
+    except ValueError as error:
+        return [f"{path}: {error}; they are taken as they are"]
+    return []
 
 
 def _unit(shared: source.Common, index: np.ndarray, unit: str | None) -> tuple[str, float]:
     """The unit's name and its millimetres: as named, by 68 landmarks, or by the size of the whole mesh."""
     points, size = shared.vertices[index], source.size(shared.vertices)
-    spread = float(np.linalg.norm(points - points.mean(axis=0))) / SPREAD if len(index) == 68 else None
+    known = faces.template68()
+    spread = faces.spread(points) / faces.spread(known) if len(index) == len(known) else None
     if unit is not None:
         scale = faces.UNITS[UNITS[unit]]
         fits = SIZES[0] < size * scale < SIZES[1] and (spread is None or SPREADS[0] < spread * scale < SPREADS[1])
@@ -241,7 +267,8 @@ def _splits(people: tuple[source.Person, ...]) -> list[str]:
     ]
 
 
-def _lacking(splits: list[str]) -> list[str]:
+def _lacking(people: tuple[source.Person, ...], splits: list[str]) -> list[str]:
     lacking = [split for split in store.SPLITS if split not in splits]
-    few = f"all splits need 4 subjects or more, got {len(splits)}"
-    return [f"nobody serves {' and '.join(lacking)}: {few}"] if lacking else []
+    told = any(who.about.get("split") for who in people)
+    why = "as the table of people has it" if told else f"all splits need 4 subjects or more, got {len(splits)}"
+    return [f"nobody serves {' and '.join(lacking)}: {why}"] if lacking else []

@@ -23,6 +23,7 @@ from facejax.data import (
 )
 from facejax.data.source import Person, Source, SourceError
 
+SEXES = ("female", "male")  # Florence 4D is split by them
 SCANS: dict[str, Callable[..., Source]] = {
     "folder": folder.scan,
     "coma": coma.scan,
@@ -116,6 +117,8 @@ def with_people(found: Source, path: Path) -> Source:
             raise SourceError(f"{row.where}: nobody is called {name!r}")
         if values.get("split", store.SPLITS[0]) not in store.SPLITS:
             raise SourceError(f"{row.where}: split: expected {', '.join(store.SPLITS)}, got {values['split']!r}")
+        if values.get("sex", SEXES[0]) not in SEXES:
+            raise SourceError(f"{row.where}: sex: expected {' or '.join(SEXES)}, got {values['sex']!r}")
         about[name] |= {key: value for key, value in values.items() if key != "name"}
     return found._replace(people=tuple(Person(who.name, about[who.name]) for who in found.people))
 

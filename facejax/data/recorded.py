@@ -44,13 +44,16 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level
     takes = []
     for person in range(actors):
         for path in recordings[person % len(performers)]:
-            name = f"{person:03d}/{path.stem}"
+            name = f"{_name(performers, person, root)}/{path.stem}"
             takes.append(Take(person, source.label_of(path.stem), name, path, (), counts[path]))
     loaded = assets.load()
     return Source(
         "livelink",
         root,
-        tuple(Person(f"{i:03d}", {"performer": performers[i % len(performers)].name}) for i in range(actors)),
+        tuple(
+            Person(_name(performers, i, root), {"performer": performers[i % len(performers)].name})
+            for i in range(actors)
+        ),
         tuple(takes),
         functools.partial(_read, rate, level),
         _rest,
@@ -61,6 +64,12 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level
         landmarks=loaded.landmarks,
         notes=tuple(notes),
     )
+
+
+def _name(performers: list[Path], person: int, root: Path) -> str:
+    """Who plays whom: "anna-003"; without performers' folders "003"."""
+    performer = performers[person % len(performers)]
+    return f"{person:03d}" if performer == root else f"{performer.name}-{person:03d}"
 
 
 def _csv(folder: Path) -> list[Path]:

@@ -163,28 +163,41 @@ def label_of(name: str) -> str:
 
 
 def numbered(paths: Sequence[Path], *, step: int | None = 1, gaps: bool = False) -> list[str]:
-    """What is odd in the numbers at the end of frames' names: "frame 12 is missing".
+    """What is odd in the numbers at the end of frames' names: "frames 12 to 13 are missing".
 
     Args:
-      paths: frames of one recording, sorted; names without a number are not looked at.
-      step: from one number to the next; None takes the smallest that occurs.
+      paths: frames of one recording, sorted; names without a number are not looked at, if none has one.
+      step: from one number to the next; None takes `step_of`.
       gaps: say what is missing instead of raising.
 
     Raises:
-      SourceError: two frames have one number, or one is missing.
+      SourceError: two frames have one number, one has none, or one is missing.
     """
-    found = [(int(match[1]), path) for path in paths if (match := re.search(r"(\d+)$", path.stem))]
-    if len(found) < len(paths):
+    numbers = [_number(path) for path in paths]
+    if all(number is None for number in numbers):
         return []
-    for (number, path), (following, other) in zip(found, found[1:], strict=False):
+    if None in numbers:
+        raise SourceError(f"{paths[numbers.index(None)]}: has no frame number, unlike the others beside it")
+    step, said = step_of(paths) if step is None else step, []
+    for number, following, path, other in zip(numbers, numbers[1:], paths, paths[1:], strict=False):
         if number == following:
             raise SourceError(f"{other}: frame {number} is {path.name} already")
-    numbers = np.array([number for number, _ in found])
-    steps = np.diff(numbers)
-    step = (int(steps.min()) if len(steps) else 1) if step is None else step
-    wide = np.flatnonzero(steps > step)
-    said = [f"{paths[i].parent}: frame {numbers[i] + step} is missing, after {paths[i].name}" for i in wide]
+        if following - number > step:
+            first, last = number + step, following - step
+            which = f"frame {first} is" if last <= first else f"frames {first} to {last} are"
+            said.append(f"{path.parent}: {which} missing, after {path.name}")
     if said and not gaps:
         more = f" ({len(said)} gaps in all)" if len(said) > 1 else ""
-        raise SourceError(f"{said[0]}{more}; allow gaps to take the frames as they are")
+        raise SourceError(f"{said[0]}{more}; --gaps takes the frames as they are")
     return said
+
+
+def step_of(paths: Sequence[Path]) -> int:
+    """The smallest step between the numbers of frames in order; 1 where there are none."""
+    numbers = [number for path in paths if (number := _number(path)) is not None]
+    return max(1, min((b - a for a, b in zip(numbers, numbers[1:], strict=False)), default=1))
+
+
+def _number(path: Path) -> int | None:
+    match = re.search(r"(\d+)$", path.stem)
+    return int(match[1]) if match else None

@@ -46,6 +46,7 @@ class Done(NamedTuple):
     curve: np.ndarray  # (T, L, 3) float32 mm
     cuts: cuts.Cuts
     restless: tuple[bool, bool]  # does not begin, does not end at rest
+    visits: int  # how often it goes to an expression and comes home
     jumps: list[int]
 
 
@@ -101,14 +102,17 @@ def do(job: Job, number: int) -> None:
     cut = job.cuts.get(number) or take.cuts or cuts.find(curve, marks)
     restless = cuts.restless(curve, marks, cuts.Cuts(*cut))
     with files.replacing(_path(job, number)) as temporary:
-        np.savez(temporary, curve=curve, cuts=cut, restless=restless, jumps=np.array(cuts.jumps(curve), np.int64))
+        visits = cuts.visits(curve, marks)
+        jumps = np.array(cuts.jumps(curve), np.int64)
+        np.savez(temporary, curve=curve, cuts=cut, restless=restless, visits=visits, jumps=jumps)
 
 
 def read(job: Job, number: int) -> Done:
     """What `do` left."""
     with np.load(_path(job, number), allow_pickle=False) as found:
         cut = cuts.Cuts(*found["cuts"].tolist())
-        return Done(found["curve"], cut, tuple(found["restless"].tolist()), found["jumps"].tolist())
+        restless, visits = tuple(found["restless"].tolist()), int(found["visits"])
+        return Done(found["curve"], cut, restless, visits, found["jumps"].tolist())
 
 
 def notes(job: Job, done: list[Done]) -> list[str]:
@@ -118,6 +122,12 @@ def notes(job: Job, done: list[Done]) -> list[str]:
         which = [name for name, one in zip(names, done, strict=True) if one.restless[i]]
         if which:
             said.append(f"{len(which)} of {len(names)} recordings do not {verb} at rest: {source.some(which)}")
+    several = [name for name, one in zip(names, done, strict=True) if one.visits > 1]
+    if several:
+        said.append(
+            f"{len(several)} of {len(names)} recordings come home more than once, as if they held several expressions: "
+            f"{source.some(several)}"
+        )
     jumps = [f"{name} frame {frame}" for name, one in zip(names, done, strict=True) for frame in one.jumps]
     if jumps:
         said.append(f"the landmarks jump at {source.some(jumps)}")

@@ -69,6 +69,10 @@ def scan(
         people.append(Person(folder.name, {}))
         neutral.append(still[0] if still else None)
         takes += [own[name] for name in sorted(own, key=source.natural)]
+    steps = [source.step_of(take.frames) for take in takes]
+    usual = max(set(steps), key=steps.count)
+    if odd := [f"{t.name} ({n})" for t, n in zip(takes, steps, strict=True) if t.frames and n != usual]:
+        notes.append(f"frames are numbered in steps of {usual}, but elsewhere: {source.some(odd)}")
     without = [person.name for person, path in zip(people, neutral, strict=True) if path is None]
     if without:
         first = "the first frame of the first recording" if rest == "first" else "the mean of the first frames"

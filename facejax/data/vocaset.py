@@ -88,17 +88,20 @@ def _rows(frames: dict, count: int, where: str, gaps: bool) -> tuple[np.ndarray,
     wide = np.flatnonzero(np.diff(numbers) > 1)
     said = [f"{where}: frame {numbers[i] + 1} is missing" for i in wide]
     if said and not gaps:
-        raise SourceError(f"{said[0]}; allow gaps to take the frames as they are")
+        raise SourceError(f"{said[0]}; --gaps takes the frames as they are")
     return rows, said
 
 
 def _rest_of(rests: Any, name: str, count: int, path: Path) -> np.ndarray:
     """A person's mesh at rest (N, 3)."""
     found = _dict(rests, path).get(name)
-    found = np.asarray(found, np.float64) if isinstance(found, (np.ndarray, list)) else np.zeros(0)
-    if found.shape != (count, 3) or not np.isfinite(found).all():
-        raise SourceError(f"{path}: {name}: expected {count} finite vertices, got {found.shape}")
-    return found
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu":
+        raise SourceError(f"{path}: holds no template of {name}")
+    if found.shape != (count, 3):
+        raise SourceError(f"{path}: {name}: expected ({count}, 3) vertices, got {found.shape}")
+    if len(bad := np.flatnonzero(~np.isfinite(found).all(axis=1))):
+        raise SourceError(f"{path}: {name}: vertex {bad[0]} is not finite: {found[bad[0]].tolist()}")
+    return found.astype(np.float64)
 
 
 def _dict(value: Any, path: Path, *keys: str) -> dict:

@@ -56,12 +56,10 @@ def _entries(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == ".npz":
         wanted = (*(name for pair in _NAMES for name in pair), *_CONTOUR)
         return arrays.read_some(path, wanted)
-    if path.suffix.lower() == ".pkl":
-        found = pickles.read(path)
-    else:
-        with path.open("rb") as stream:
+    with path.open("rb") as stream:
+        if path.suffix.lower() == ".npy":
             arrays.skip_object_header(stream)
-            found = pickles.load(stream)
+        found = pickles.load(stream)
     if isinstance(found, np.ndarray) and found.shape == ():
         found = found.item()
     if not isinstance(found, dict):

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import itertools
 import os
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
 
+from facejax.geometry import align
 from facejax.io import meshes
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
 SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
+ALIKE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
 HEAD_RANGE = (100.0, 400.0)  # mm, the longest side of a head, or of a face alone, from chin to brow
 
 
@@ -60,9 +63,33 @@ def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> 
     marks = topology.landmark_index
     turn = _axes(vertices[marks], topology.vertices[marks], name)
     notes += axes_note(turn)
-    millimetres, unit = unit_of(_spread(vertices[marks]) / _spread(topology.vertices[marks]), name)
+    millimetres, unit = unit_of(spread(vertices[marks]) / spread(topology.vertices[marks]), name)
     notes += [f"read as {unit}"] if unit != "millimetres" else []
     return Face((vertices @ turn.T * millimetres).astype(np.float32), tuple(notes))
+
+
+def place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
+    """Rotation (3, 3) from the template's landmarks (C, 3) to a mesh's, and the mesh's size against the template's.
+
+    Raises `ValueError` where the two are not alike.
+    """
+    spread, wanted = (float(np.linalg.norm(p - p.mean(axis=0))) for p in (points, template))
+    shapes = ((p - p.mean(axis=0)) / s for p, s in ((points, spread), (template, wanted)))
+    shape, target = (s.astype(np.float32) for s in shapes)
+    fit = align.procrustes(target, shape, scaling=True)
+    off = float(np.linalg.norm(np.asarray(align.apply(fit, target)) - shape))
+    if off > ALIKE:
+        raise ValueError(
+            f"its {len(points)} landmarks do not form a face (distance {off:.3f} of at most {ALIKE}): are they "
+            "in the order of the scheme, left and right as the subject has them?"
+        )
+    return np.asarray(fit.rotation, np.float64), spread / wanted
+
+
+def template68() -> np.ndarray:
+    """The 68 landmarks (68, 3) float64 of MakeHuman's average face at rest, in mm."""
+    with resources.files("facejax.assets").joinpath("face68.npy").open("rb") as stream:
+        return np.load(stream, allow_pickle=False).astype(np.float64)
 
 
 def unit_of(size: float, name: str) -> tuple[float, str]:
@@ -108,15 +135,16 @@ def axes_note(turn: np.ndarray) -> list[str]:
     return [f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"]
 
 
-def _spread(points: np.ndarray) -> float:
+def spread(points: np.ndarray) -> float:
+    """The norm of points (K, 3) about their centroid."""
     return float(np.linalg.norm(points - points.mean(axis=0)))
 
 
 def _axes(points: np.ndarray, target: np.ndarray, name: str) -> np.ndarray:
     """Of the 24 rotations that permute the axes, the one under which the landmarks look most like the template's."""
-    if _spread(points) == 0:
+    if spread(points) == 0:
         raise meshes.MeshError(f"{name}: all landmarks coincide: this is no face")
-    shape, wanted = ((p - p.mean(axis=0)) / _spread(p) for p in (points, target))
+    shape, wanted = ((p - p.mean(axis=0)) / spread(p) for p in (points, target))
     nearest = min(turns(), key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
     best = np.linalg.norm(shape @ nearest.T - wanted)
     if best > 0.6:

@@ -83,7 +83,8 @@ def query(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None,
     best = np.argmin(cost, axis=1)
     row = np.arange(len(points))
     face, at = candidates[row, best], found[row, best]
-    weights = trimesh.triangles.points_to_barycentric(on.vertices[on.faces[face]], at)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weights = trimesh.triangles.points_to_barycentric(on.vertices[on.faces[face]], at)
     bad = ~np.isfinite(weights).all(axis=1)  # a triangle without area
     weights = np.clip(np.where(bad[:, None], 1 / 3, weights), 0, 1)
     return Hits(face, weights / weights.sum(axis=1, keepdims=True), at, distance[row, best])

@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from facejax import io
-from facejax.data import cuts, folder, ingest, meshes, motions, source, store
+from facejax.data import cuts, folder, meshes, motions, source, store
+from facejax.io import faces
 
 MARKS = [0, 20, 61, 99, 140]
 CURVE = np.array([0, 0.02, 0.3, 0.7, 0.97, 1, 0.98, 0.6, 0.2, 0.03, 0], np.float32)  # a recording: how far it has gone
@@ -191,7 +192,7 @@ def scaled(root, ball, by):
 
 def test_68_landmarks_tell_the_unit_of_any_mesh(template, tmp_path):
     points = template.vertices[template.landmarks]
-    assert np.linalg.norm(points - points.mean(axis=0)) == pytest.approx(ingest.SPREAD, abs=0.1)
+    np.testing.assert_allclose(faces.template68(), points, atol=1e-4)
     # With shoulders the mesh is larger than a head; the landmarks are not. Three times as large, they are no face's.
     bust = np.concatenate([template.vertices, [[0, -700, 0]]]) / 1000
     rng = np.random.default_rng(0)
@@ -398,7 +399,7 @@ def test_requests_that_cannot_be_met(capture, ball, tmp_path):
     assert "lies among the meshes" in told(capture, capture / "S0" / "store")
     assert f"{tmp_path / 'file'} is not a folder" in told(capture, tmp_path / "file" / "deeper" / "store")
     assert "rate: expected frames per second" in told(capture, tmp_path / "o", rate=float("nan"))
-    assert "most: expected 1 mesh" in told(capture, tmp_path / "o", most=0)
+    assert "(--meshes): expected 1 mesh" in told(capture, tmp_path / "o", most=0)
     point = tmp_path / "point"
     (point / "S0").mkdir(parents=True)
     np.savez(point / "S0" / "a.npz", vertices=np.ones((3, 162, 3)), faces=ball[1])

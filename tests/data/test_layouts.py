@@ -103,7 +103,7 @@ def test_bu3dfe_leaves_out_who_has_no_neutral_mesh(capture, marks, tiny_store):
     moved = np.concatenate([motion(tiny_store, s, e, strengths) for s in (0, 2) for e in range(2)])
     np.testing.assert_array_equal(data.vertices, millimetres(moved, 1))
     assert {s[4:8] for s in data.sequences} == {(0, 4, 4, 4)}
-    assert any("32 meshes are missing: F0001_FE01" in note for note in data.index["notes"])
+    assert any("8 emotions are missing: F0001/fear" in note for note in data.index["notes"])
 
 
 def test_bu4dfe_has_landmarks_alone(tmp_path, tiny_store):
@@ -145,6 +145,7 @@ def test_tables_beside_a_dataset(capture, marks, tiny_store):
         ("labels", "subject,recording,label\nsubject0,1+2,\n", "labels.csv: line 2: label is empty"),
         ("labels", "subject,recording,label\nsubject0,1+2,a>b\n", "labels.csv: line 2: a label cannot hold '>'"),
         ("people", "subject,split\nsubject0,dev\n", "people.csv: line 2: split: expected train, validation, test, got"),
+        ("people", "subject,sex\nsubject0,f\n", "people.csv: line 2: sex: expected female or male, got 'f'"),
         ("people", "subject,split\nJane,test\n", "people.csv: line 2: nobody is called 'Jane'"),
     ):
         (folder / f"{name}.csv").write_text(text)
@@ -179,7 +180,7 @@ def _twice(root, frame):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (_missing, r"00137_TA/cheeks_in: frame 5 is missing, after cheeks_in.000004.ply; allow gaps"),
+        (_missing, r"00137_TA/cheeks_in: frame 5 is missing, after cheeks_in.000004.ply; --gaps takes"),
         (_cut, r"cheeks_in.000005.ply: ends early: face needs \d+ bytes, \d+ are left"),
         (_fewer, r"cheeks_in.000005.ply: 100 vertices, expected 3260 as in \S*bareteeth.000001.ply"),
         (_nan, r"cheeks_in.000005.ply: vertex 40 is not finite: \[.*nan.*\] \(1 in all\)"),
@@ -198,10 +199,31 @@ def test_a_bad_frame_is_named_and_nothing_is_left(capture, marks, damage, messag
 
 def test_gaps_can_be_allowed(capture, marks):
     root = capture("coma")
-    (root / "FaceTalk_170721_00137_TA" / "cheeks_in" / "cheeks_in.000005.ply").unlink()
+    for number in (5, 6):
+        (root / "FaceTalk_170721_00137_TA" / "cheeks_in" / f"cheeks_in.{number:06d}.ply").unlink()
     data = prepared(root, marks, gaps=True)
-    assert [s.frames for s in data.sequences] == [9, 9, 9, 9, 8, 9]
-    assert any("cheeks_in: frame 5 is missing, after cheeks_in.000004.ply" in note for note in data.index["notes"])
+    assert [s.frames for s in data.sequences] == [9, 9, 9, 9, 7, 9]
+    assert any("cheeks_in: frames 5 to 6 are missing, after cheeks_in.000004.ply" in n for n in data.index["notes"])
+
+
+def test_a_frame_without_a_number_and_other_steps(capture, marks):
+    take = capture("d3dfacs") / "subject1" / "1+2"
+    (take / "1+2_mean.ply").write_bytes((take / "1+2_7.ply").read_bytes())
+    with pytest.raises(source.SourceError, match=r"1\+2_mean.ply: has no frame number, unlike the others beside it"):
+        prepared(take.parents[1], marks)
+    (take / "1+2_mean.ply").unlink()
+    for number in (8, 10, 12, 14):
+        (take / f"1+2_{number}.ply").unlink()
+    found = layouts.scan("folder", take.parents[1])
+    assert "frames are numbered in steps of 1, but elsewhere: subject1/1+2 (2)" in found.notes
+
+
+def test_recordings_of_several_expressions_are_said(tmp_path, marks, tiny_store):
+    (tmp_path / "root" / "S0").mkdir(parents=True)
+    moved = np.concatenate([motion(tiny_store, 0, e) for e in (27, 27)])
+    np.savez(tmp_path / "root" / "S0" / "rom.npz", vertices=moved, faces=tiny_store.faces)
+    data = prepared(tmp_path / "root", marks, layout="folder")
+    assert any("1 of 1 recordings come home more than once" in note for note in data.index["notes"])
 
 
 def test_landmarks_and_units_that_do_not_fit(capture, marks, tmp_path, tiny_store):
@@ -215,6 +237,13 @@ def test_landmarks_and_units_that_do_not_fit(capture, marks, tmp_path, tiny_stor
 
     assert "bareteeth.000001.ply: 0.2" in (text := told(unit="mm")) and "another unit?" in text
     assert "coma: its meshes need a file of landmarks" in told(landmarks=None)
+    good = np.asarray(tiny_store.landmark_index)
+    assert "workers: expected 1 or more, got 0" in told(workers=0)
+    points = np.asarray(tiny_store.neutral[0])[good]
+    marks.write_text(json.dumps({"points": points.tolist()}))  # millimetres, on meshes in metres
+    assert "another unit" in told()
+    marks.write_text(json.dumps({"points": (points / 1000 + [0, 0, 0.05]).tolist()}))
+    assert "marks.json: landmark" in (text := told()) and "another mesh?" in text
     marks.write_text(json.dumps({"indices": [1, 2, 3, 3260]}))
     assert "marks.json: indices[3]: 3260 is out of range; vertices are 0..3259" in told()
     marks.write_text(json.dumps({"indices": [1, 2, 3]}))
@@ -278,6 +307,12 @@ def test_held_heads_come_back_to_where_they_were(tmp_path, marks, tiny_store):
     true = moved + [0, 3, 1]
     np.testing.assert_allclose(held.vertices, true, atol=0.5)  # of 20 mm: the lip moves what should stay put a little
     assert off[1] < 0.05 * off[0]
+
+
+def test_landmarks_that_are_no_face_are_said(capture, marks, tiny_store):
+    marks.write_text(json.dumps({"indices": np.asarray(tiny_store.landmark_index)[::-1].tolist()}))
+    data = prepared(capture("coma"), marks)
+    assert any("its 68 landmarks do not form a face" in note and "as they are" in note for note in data.index["notes"])
 
 
 def test_jumps_are_named():

@@ -21,7 +21,7 @@ def takes(tmp_path):
 def test_every_performer_plays_people_of_their_own(takes, tmp_path):
     data = layouts.prepare("livelink", takes, tmp_path / "store", actors=4, level=1)
     assert [(s["name"], s["performer"]) for s in data.index["subjects"]] == [
-        ("000", "anna"), ("001", "ben"), ("002", "anna"), ("003", "ben"),
+        ("anna-000", "anna"), ("ben-001", "ben"), ("anna-002", "anna"), ("ben-003", "ben"),
     ]  # fmt: skip
     assert [(s.subject, s.label, s.frames) for s in data.sequences] == [
         (i, "mouth_open", n) for i in range(4) for n in (36, 38)
