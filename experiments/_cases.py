@@ -76,6 +76,12 @@ def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
             found += _PUBLISHED.get(name, _four_folds)(everybody, split)
         else:
             raise ValueError(f"unknown split {split!r}, expected identity, expression or test")
+    for case in found:
+        if not case.train.count or not case.test.count:
+            what = "fit to" if not case.train.count else "judge on"
+            raise ValueError(
+                f"{data.path}: the split by {case.split} leaves nothing to {what}: too few people, or names"
+            )
     return found
 
 

@@ -20,6 +20,7 @@ MATCHES = 10  # rounds of matching for the morphable model
 COUNTED = 400.0  # matches, at 1 mm each, that all together count as: neighbours say the same
 STIFF = (300.0, 100.0, 30.0, 10.0, 3.0, 1.0)  # smoothness against a match, round by round
 FAR = (25.0, 5.0)  # mm beyond which a match is none, in the first and the last round
+SLIDE = 0.05  # the share of a match that holds along the surface
 FACING = 0.5  # the least cosine between the normals of a match
 REACH = 15.0  # mm from the template's surface to where the scan no longer moves with it
 
@@ -166,12 +167,10 @@ def _refine(model: Shape, start: np.ndarray, scan: nearest.Surface, marks: np.nd
     for stiff, far in zip(STIFF, np.linspace(*FAR, len(STIFF)), strict=True):
         match, normals, weight = _matches(here, model.faces, scan, far)
         # Onto the tangent plane, and a little onto the point itself, so that nothing slides away.
-        block = weight[:, None, None] * (normals[:, :, None] * normals[:, None, :] + 0.05 * np.eye(3))
-        block += pull[:, None, None] * np.eye(3)
-        data = sparse.block_diag(list(block), format="csc")
-        right = np.einsum("nij,nj->ni", weight[:, None, None] * (normals[:, :, None] * normals[:, None, :]
-                          + 0.05 * np.eye(3)), match - start)  # fmt: skip
+        block = weight[:, None, None] * (normals[:, :, None] * normals[:, None, :] + SLIDE * np.eye(3))
+        right = np.einsum("nij,nj->ni", block, match - start)
         right[at] += pull[at, None] * (marks - start[at])
+        data = sparse.block_diag(list(block + pull[:, None, None] * np.eye(3)), format="csc")
         # A little of staying put keeps what is neither matched nor connected.
         system = data + stiff * smooth + 1e-4 * sparse.eye(3 * count, format="csc")
         here = start + splu(system.tocsc()).solve(right.ravel()).reshape(count, 3)
