@@ -195,7 +195,8 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 def _plot(path: Path, rows: list[dict[str, Any]]) -> Path:
-    figure, axes = plt.subplots(1, 2, figsize=(8.4, 3.4), constrained_layout=True)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), constrained_layout=True)
+    sizes = sorted({row["vertices"] for row in rows})
     for axis, name, title in zip(
         axes, ("surface_mm", "correspondence_mm"), ("to the true surface", "to the true place"), strict=True
     ):
@@ -207,10 +208,12 @@ def _plot(path: Path, rows: list[dict[str, Any]]) -> Path:
                         [row["vertices"] for row in mine], [row[name] for row in mine], style, color=colour,
                         marker="o", ms=3, label=f"{kind}, {marks} landmarks",
                     )  # fmt: skip
-        axis.set(
-            title=title, xscale="log", xlabel="vertices of the scan", ylabel="mm, mean over the face", ylim=(0, None)
-        )
-    axes[1].legend(frameon=False, fontsize=8)
+        axis.set(title=title, xscale="log", xlabel="vertices of the scan", ylabel="mm, mean over the face")
+        axis.set_ylim(0)
+        axis.minorticks_off()
+        axis.set_xticks(sizes, [f"{size:,}" for size in sizes])
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, fontsize=8, loc="outside right center")
     figure.savefig(path, dpi=110)
     plt.close(figure)
     return path

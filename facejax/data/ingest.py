@@ -1,8 +1,9 @@
 """A store of recordings: every frame checked and written once, by all processors; stopped at any moment, it goes on.
 
-Frames are read one at a time. What is done lies in a hidden folder beside the store until all is done; an error takes
-it away again, an interruption leaves it, and the same request goes on there and comes to the same bytes. One order of
-vertices, the same triangles, one unit; y up, z forward. T frames, N vertices, L landmarks.
+Frames are read one at a time. What is done lies in a hidden folder beside the store until all is done. Something wrong
+with the recordings takes it away again; an interruption, a process lost or a full disk leave it, and the same request
+goes on there and comes to the same bytes. One order of vertices, the same triangles, one unit; y up, z forward.
+T frames, N vertices, L landmarks.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ def prepare(
         takes.do_all(job, workers, progress)
         _finish(job, notes, part / "store")
         os.replace(part / "store", out)
-    except Exception:
+    except SourceError:
         shutil.rmtree(part, ignore_errors=True)
         raise
     shutil.rmtree(part)

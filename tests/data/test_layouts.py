@@ -396,6 +396,24 @@ def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_p
     assert seen[3:] == [0, 1, 2, 3, 4, 5]
 
 
+@pytest.mark.parametrize("trouble", [OSError("No space left on device"), RuntimeError("a process was lost")])
+def test_trouble_that_is_not_of_the_recordings_loses_nothing(capture, marks, tmp_path, monkeypatch, trouble):
+    root = capture("coma")
+    whole, real, seen = prepared(root, marks, out="whole"), takes.do, []
+
+    def fail(job, number):
+        if number == 2:
+            raise trouble
+        real(job, number)
+
+    monkeypatch.setattr(takes, "do", fail)
+    with pytest.raises(type(trouble)):
+        prepared(root, marks)
+    assert not (tmp_path / "store").exists()
+    monkeypatch.setattr(takes, "do", lambda job, number: (seen.append(number), real(job, number)))
+    assert _bytes(prepared(root, marks)) == _bytes(whole) and seen == [2, 3, 4, 5]
+
+
 def _bytes(data: store.Store) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in data.path.iterdir()}
 
