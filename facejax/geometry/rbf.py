@@ -19,13 +19,16 @@ surface has no spike at a landmark; with p and P'q = 0 an affine motion of the l
 The system depends on the rest alone: it is solved once per face, and all frames become one product. Kept for it are
 not the coefficients q, which grow by thousands where kernels overlap, but how far each landmark's displacement moves
 each vertex, [phi(v), 1, v] times the inverse: numbers of about 1, for which float32 is enough. They are made in float64
-on the host.
+on the host, the system by LAPACK, and what grows with the mesh by XLA: NumPy's products take a thread pool of their own,
+whose threads spin on for a while and then hold up JAX's (10,000 vertices: 1 ms instead of 6).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,16 +37,14 @@ from scipy.linalg import lapack
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-CHUNK = 512  # vertices at a time: their kernel values stay in the cache
-BLOCK = 48  # rows of a product
 COINCIDENT = 1e-6  # of the landmarks' extent: nearer ones are one point, flatter ones a plane
 EXACT = 1e-6  # the part of its displacement by which the solved system may miss a landmark
 
 
 class Kernel(NamedTuple):
-    """A radial function of r squared, which it may overwrite; its usual sigma; whether it can do without p."""
+    """A radial function of r squared, by NumPy or jax.numpy; its usual sigma; whether it can do without p."""
 
-    phi: Callable[[np.ndarray], np.ndarray]
+    phi: Callable[[ModuleType, Any], Any]
     sigma: float
     definite: bool
 
@@ -88,8 +89,7 @@ def fit(
         raise ValueError(f"affine=False: {kernel} needs its affine term; gaussian and wendland_c2 do not")
     unit, origin = float(sigma * _spacing(rest, affine)), rest.mean(axis=0)
     centres = (rest - origin) / unit
-    system = np.empty((len(rest), len(rest)))
-    _fill(kernel, centres, centres, system)
+    system = KERNELS[kernel].phi(np, cdist(centres, centres, "sqeuclidean"))
     system[np.diag_indices(len(rest))] += smoothing
     if affine:
         terms = np.concatenate([np.ones((len(rest), 1)), centres], axis=1)
@@ -110,16 +110,7 @@ def weights(fit: Fit, vertices: np.ndarray) -> np.ndarray:
 
     In float64 on the host, once per face. Raises `ValueError` for vertices that are not finite, or traced.
     """
-    basis = _basis(fit, _points(vertices, "vertices"))
-    # One product of all rows is shared out among BLAS's threads, and where others use the cores too they wait for one
-    # another (10,000 vertices: 10 ms); blocks this small are not (3 ms, and on a quiet machine 2.3 against 1.8).
-    blocks = len(basis) // BLOCK
-    whole = blocks * BLOCK
-    out = np.empty((len(basis), len(fit.centres)), np.float32)
-    stacked = basis[:whole].reshape(blocks, BLOCK, len(fit.inverse)) @ fit.inverse
-    out[:whole] = stacked.reshape(whole, len(fit.centres))
-    out[whole:] = basis[whole:] @ fit.inverse
-    return out
+    return _spread(fit, _points(vertices, "vertices"), np.float32)
 
 
 @jax.jit
@@ -134,9 +125,11 @@ def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
     for name, array in (("weights", weights), ("displacements", displacements)):
         if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
             raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
-    # GPUs multiply float32 with ten bits of mantissa unless told otherwise. `einsum` takes half the time of `matmul`,
-    # which makes one narrow product per frame.
-    return jnp.einsum("...nl,...lc->...nc", weights, displacements, precision=jax.lax.Precision.HIGHEST)
+    # GPUs multiply float32 with ten bits of mantissa unless told otherwise. One product for each axis: the batched one
+    # of (N, L) by (L, 3) is so narrow that a CPU takes two to four times as long.
+    precision = jax.lax.Precision.HIGHEST
+    axes = [jnp.einsum("...nl,...l->...n", weights, displacements[..., c], precision=precision) for c in range(3)]
+    return jnp.stack(axes, axis=-1)
 
 
 def apply(fit: Fit, displacements: jax.Array, vertices: np.ndarray) -> jax.Array:
@@ -166,55 +159,50 @@ def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **o
             found = fit(rest + before, **options)
         except ValueError as error:
             raise ValueError(f"frame {t}: {error}") from error
-        moved += _basis(found, moved) @ (found.inverse @ (here - before))
+        moved = moved + _spread(found._replace(inverse=found.inverse @ (here - before)), moved, np.float64)
         out[t], before = moved - start, here
     return out
 
 
-def _basis(fit: Fit, vertices: np.ndarray) -> np.ndarray:
-    """[phi(v), 1, v] (N, L + 4), or (N, L) without p."""
-    points, count = (vertices - fit.origin) / fit.unit, len(fit.centres)
-    basis = np.empty((len(points), len(fit.inverse)))
-    _fill(fit.kernel, points, fit.centres, basis[:, :count])
-    if len(fit.inverse) > count:
-        basis[:, count], basis[:, count + 1 :] = 1, points
-    return basis
+def _spread(fit: Fit, vertices: np.ndarray, dtype: type) -> np.ndarray:
+    """How far each landmark moves each vertex (N, 3): (N, L) of a dtype, computed in float64."""
+    host = jax.devices("cpu")[0]
+    # Also within a trace: everything here is known.
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True), jax.default_device(host):
+        return np.asarray(_spread_on(fit.kernel, dtype, fit[1:], vertices))
 
 
-def _fill(kernel: str, points: np.ndarray, centres: np.ndarray, out: np.ndarray) -> None:
-    """Write phi at points (N, 3) about centres (L, 3) into (N, L)."""
-    for start in range(0, len(points), CHUNK):
-        # Not |v|^2 - 2 v.c + |c|^2 by a product, which cancels at the landmarks, and is shared out among threads too.
-        squared = cdist(points[start : start + CHUNK], centres, "sqeuclidean")
-        out[start : start + CHUNK] = KERNELS[kernel].phi(squared)
+@partial(jax.jit, static_argnums=(0, 1))
+def _spread_on(kernel: str, dtype: type, fit: tuple, vertices: jax.Array) -> jax.Array:
+    centres, origin, unit, inverse = fit
+    points = (vertices - origin) / unit
+    # Not |v|^2 - 2 v.c + |c|^2 by a product, which cancels at the landmarks.
+    squared = sum(jnp.square(points[:, None, axis] - centres[:, axis]) for axis in range(3))
+    basis = KERNELS[kernel].phi(jnp, squared)
+    if len(inverse) > len(centres):
+        basis = jnp.concatenate([basis, jnp.ones_like(points[:, :1]), points], axis=1)
+    return (basis @ inverse).astype(dtype)
 
 
-def _gaussian(squared: np.ndarray) -> np.ndarray:
-    squared *= -0.5
-    return np.exp(squared, out=squared)
+def _gaussian(xp: ModuleType, squared: Any) -> Any:
+    return xp.exp(-0.5 * squared)
 
 
-def _multiquadric(squared: np.ndarray) -> np.ndarray:
-    squared += 1
-    return np.negative(np.sqrt(squared, out=squared), out=squared)
+def _multiquadric(xp: ModuleType, squared: Any) -> Any:
+    return -xp.sqrt(1 + squared)
 
 
-def _thin_plate(squared: np.ndarray) -> np.ndarray:
-    logarithm = np.log(np.maximum(squared, np.finfo(np.float64).tiny))
-    squared *= np.multiply(logarithm, 0.5, out=logarithm)
-    return squared
+def _thin_plate(xp: ModuleType, squared: Any) -> Any:
+    return 0.5 * squared * xp.log(xp.maximum(squared, np.finfo(np.float64).tiny))
 
 
-def _triharmonic(squared: np.ndarray) -> np.ndarray:
-    squared *= np.sqrt(squared)
-    return squared
+def _triharmonic(xp: ModuleType, squared: Any) -> Any:
+    return squared * xp.sqrt(squared)
 
 
-def _wendland_c2(squared: np.ndarray) -> np.ndarray:
-    r = np.minimum(np.sqrt(squared, out=squared), 1, out=squared)
-    fourth = np.square(np.square(1 - r))
-    fourth *= 4 * r + 1
-    return fourth
+def _wendland_c2(xp: ModuleType, squared: Any) -> Any:
+    r = xp.minimum(xp.sqrt(squared), 1)
+    return xp.square(xp.square(1 - r)) * (4 * r + 1)
 
 
 # Signed so that phi is positive definite (for q with P'q = 0): smoothing then smooths. Default kernel and widths are
