@@ -19,8 +19,8 @@ surface has no spike at a landmark; with p and P'q = 0 an affine motion of the l
 The system depends on the rest alone: it is solved once per face, and all frames become one product. Kept for it are
 not the coefficients q, which grow by thousands where kernels overlap, but how far each landmark's displacement moves
 each vertex, [phi(v), 1, v] times the inverse: numbers of about 1, for which float32 is enough. They are made in float64
-on the host, the system by LAPACK, and what grows with the mesh by XLA: NumPy's products take a thread pool of their own,
-whose threads spin on for a while and then hold up JAX's (10,000 vertices: 1 ms instead of 6).
+on the host, the system by LAPACK, what grows with the mesh by XLA: NumPy's products have threads of their own, which
+spin on for a while and then hold up JAX's (10,000 vertices: 1 ms instead of 6).
 """
 
 from __future__ import annotations

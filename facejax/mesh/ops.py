@@ -10,8 +10,8 @@ position, and gathering sums 14 / 60. Upsampling and multiplication commute, so 
 the coarse side: a quarter of the arithmetic. The transposed gather of the finest upsampling takes 19 ms
 as a scatter, 5 ms by inverse lists. Written out position by position, XLA fuses the producer of the
 gradient into each of some 300 gathers (387 ms, 36 s to compile); a scan keeps it in memory and compiles
-in a second or two. All of that is a CPU's and of whole batches. On a GPU the scan's many small kernels are what takes time
-(an H200: 0.76 / 2.1 ms), and all positions at once are faster (0.43 / 0.82 ms).
+in a second or two. All of that is a CPU's and of whole batches. On a GPU the scan's many small kernels are
+what takes time (an H200: 0.76 / 2.1 ms), and all positions at once are faster (0.43 / 0.82 ms).
 """
 
 from __future__ import annotations
@@ -72,9 +72,9 @@ def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> ja
     """
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
-    products = x.reshape(count * batch, channels) @ kernel.transpose(1, 0, 2).reshape(channels, positions * out_channels)
-    products = products.reshape(count, batch, positions, out_channels).transpose(0, 2, 1, 3)
-    products = products.reshape(count * positions, batch * out_channels)
+    flat_kernel = kernel.transpose(1, 0, 2).reshape(channels, positions * out_channels)
+    products = (x.reshape(count * batch, channels) @ flat_kernel).reshape(count, batch, positions, out_channels)
+    products = products.transpose(0, 2, 1, 3).reshape(count * positions, batch * out_channels)
     summed = _stencil_p.bind(products, *_joined(stencil), axis=0, transposed=False)
     return summed.reshape(stencil.source.shape[2], batch, out_channels)
 
