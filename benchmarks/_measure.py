@@ -1,62 +1,136 @@
-"""How benchmarks measure: warm-up, then repeats of several functions in turn, minimum and median.
+"""How benchmarks measure: functions in turns, in one process, their first call apart from the steady time after it.
 
-Machines are noisy and drift: functions to compare are run interleaved in one process, and their ratio is the headline.
+Machines are noisy and drift: what is to be compared runs in turns, and the ratio of medians is the headline. A row is
+
+    {"name", "first_s", "min_s", "median_s", "per_s", "unit",   of our own way; first_s holds compilation
+     "peer", "peer_median_s", "ratio",                          the fastest of the peers, and how much slower it is
+     "gflop", "roofline_share",                                 see `benchmarks._roofline`
+     "sides": {name: {"first_s", "min_s", "median_s"}}}         everybody
+
+with None where there is no peer, or no count of operations. `calls` says how many times a side does the work in one
+call, where it is timed scanned.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
-import platform
-import resource
-import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
-import numpy as np
+import tyro
+
+from benchmarks import _machine, _roofline, _sizes, _timing
+from facejax import files, runtime
+
+OURS = "facejax"
+Row = dict[str, Any]
+Found = tuple[list[Row], list[Row]]  # works, and costs against size
 
 
-def interleaved(functions: dict[str, Callable[[], Any]], *, repeats: int = 20) -> dict[str, dict[str, float]]:
-    """First-call, minimum and median seconds of each function; results are waited for."""
-    first = {}
-    for name, function in functions.items():
-        begun = time.perf_counter()
-        jax.block_until_ready(function())
-        first[name] = time.perf_counter() - begun
-    times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(repeats):
-        for name, function in functions.items():
-            begun = time.perf_counter()
-            jax.block_until_ready(function())
-            times[name].append(time.perf_counter() - begun)
-    return {
-        name: {"first_s": first[name], "min_s": min(t), "median_s": statistics.median(t)} for name, t in times.items()
-    }
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What every benchmark understands."""
+
+    json: Path | None = None
+    """Also write the rows here."""
+    quick: bool = False
+    """Fewer repeats, and no costs against size."""
 
 
-def machine() -> dict[str, Any]:
-    """What ran it."""
-    return {
-        "cores": os.cpu_count(),
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "device": jax.devices()[0].device_kind,
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
-    }
+Chosen = TypeVar("Chosen", bound=Options)
 
 
-def report(rows: list[dict[str, Any]], path: Path | None) -> None:
-    """Print rows as a Markdown table; with a path, write them with the machine as JSON."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    print("| " + " | ".join(columns) + " |\n|" + " --- |" * len(columns))
-    for row in rows:
-        cells = [f"{row[c]:.4g}" if isinstance(row.get(c), float) else str(row.get(c, "")) for c in columns]
-        print("| " + " | ".join(cells) + " |")
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"rows": rows, "machine": machine()}, indent=1) + "\n")
+def row(
+    name: str,
+    functions: Mapping[str, Callable[[], Any]],
+    *,
+    peers: Sequence[str] = (),
+    repeats: int = 20,
+    calls: Mapping[str, int] | None = None,
+    items: int = 1,
+    unit: str = "",
+    gflop: float | None = None,
+    gbyte: float | None = None,
+    **about: Any,
+) -> Row:
+    """Time functions in turns, of which one is ours; a call makes so many items at so many operations and bytes."""
+    jax.clear_caches()  # the first call compiles again what was compiled for the checks
+    found = _timing.interleaved(functions, repeats=repeats)
+    for side, count in (calls or {}).items():
+        found[side] |= {key: found[side][key] / count for key in ("min_s", "median_s")}
+    ours, peer = found[OURS], min(peers, key=lambda side: found[side]["median_s"], default=None)
+    median = found[peer]["median_s"] if peer else None
+    made = {"name": name, **ours, "per_s": items / ours["median_s"], "unit": unit}
+    made |= {"peer": peer, "peer_median_s": median, "ratio": median / ours["median_s"] if peer else None}
+    share = _roofline.share(ours["median_s"], gflop=gflop, gbyte=gbyte)
+    made |= {"gflop": gflop, "roofline_share": share, **about, "sides": found}
+    print(_told(made), file=sys.stderr, flush=True)
+    return made
+
+
+def lone(name: str, times: Mapping[str, float], *, items: int = 1, unit: str = "", **about: Any) -> Row:
+    """A row of what was timed elsewhere, with no peer."""
+    made = {"name": name, **times, "per_s": items / times["median_s"], "unit": unit}
+    made |= dict.fromkeys(("peer", "peer_median_s", "ratio", "gflop", "roofline_share"))
+    made |= {**about, "sides": {OURS: dict(times)}}
+    print(_told(made), file=sys.stderr, flush=True)
+    return made
+
+
+def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -> None:
+    """Parse the command line, measure, print the tables, write the file. Bad input: one line, exit code 2."""
+    description = sys.modules[run.__module__].__doc__
+    config = tyro.cli(config_type, prog=f"python -m benchmarks.{name}", description=description)
+    runtime.keep_memory()  # for the peers in this process too
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+    begun = time.perf_counter()
+    try:
+        rows, sizes = run(config)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"benchmarks.{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        raise SystemExit(2) from error
+    print(table(rows))
+    if sizes:
+        print("\n" + _sizes.table(sizes))
+    if config.json is not None:
+        about = {"seconds": round(time.perf_counter() - begun, 1), "load": load}
+        write(config.json, {"benchmark": name, **about, "rows": rows, "sizes": sizes, "machine": _machine.about()})
+
+
+def write(path: Path, document: Any) -> None:
+    """A JSON file, whole or not at all."""
+    with files.replacing(path) as temporary:
+        temporary.write_text(json.dumps(document, indent=1) + "\n")
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Rows as Markdown."""
+    lines = ["| work | median | min | first call | rate | fastest peer | ratio | of the roofline |", "|" + " --- |" * 8]
+    for made in rows:
+        peer = f"{made['peer']}: {seconds(made['peer_median_s'])}" if made["peer"] else ""
+        ratio = f"{made['ratio']:.2f}x" if made["ratio"] else ""
+        share = f"{made['roofline_share']:.0%}" if made["roofline_share"] else ""
+        times = " | ".join(seconds(made[key]) for key in ("median_s", "min_s", "first_s"))
+        rate = f"{made['per_s']:,.4g} {made['unit']}/s" if made["unit"] else ""
+        memory = f" ({made['memory_mb']:,.0f} MB)" if "memory_mb" in made else ""
+        lines.append(f"| `{made['name']}`{memory} | {times} | {rate} | {peer} | {ratio} | {share} |")
+    return "\n".join(lines)
+
+
+def seconds(value: float) -> str:
+    """A time to three digits, in the unit that suits it."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value * 1e6:.3g} us"
+
+
+def _told(made: Row) -> str:
+    sides = (f"{side} {seconds(times['median_s'])}" for side, times in made["sides"].items())
+    return f"{made['name']}: {', '.join(sides)}"

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from benchmarks._torch import tensor
 from facejax import training
 from facejax.fit_motion import FlowPlan, GanPlan
 from facejax.models import charts, flow
@@ -30,9 +31,9 @@ class Peer:
 
     def __init__(self, state: training.TrainState, held: Any, plan: GanPlan | FlowPlan):
         (values, conditions), chart = held
-        self.data = [_tensor(array) for array in (values, *conditions)]
-        self.chart, self.plan, self.done = jax.tree.map(_tensor, chart), plan, 0
-        self.average, self.weights = jax.tree.map(_tensor, state.extra), jax.tree.map(_tensor, state.params)
+        self.data = [tensor(array) for array in (values, *conditions)]
+        self.chart, self.plan, self.done = jax.tree.map(tensor, chart), plan, 0
+        self.average, self.weights = jax.tree.map(tensor, state.extra), jax.tree.map(tensor, state.params)
         for weight in jax.tree.leaves(self.weights):
             weight.requires_grad_()
 
@@ -181,9 +182,9 @@ def check(peer: Peer, advance: Callable, start: training.TrainState, rows: np.nd
     """A peer that does something else is none: three steps' metrics, and where weights and averages have gone."""
     state = jax.tree.map(jnp.copy, start)  # what is donated is the copy
     for _ in range(3):
-        draws = map(_tensor, peer.draws(state, len(rows)))
+        draws = map(tensor, peer.draws(state, len(rows)))
         state, expected = advance(state, rows, held)
-        found = peer.step(_tensor(rows), draws)
+        found = peer.step(tensor(rows), draws)
         assert found.keys() == expected.keys(), (sorted(found), sorted(expected))
         for name, value in expected.items():
             np.testing.assert_allclose(found[name].item(), value, rtol=1e-3, atol=1e-5, err_msg=name)
@@ -199,13 +200,7 @@ def _normals(key: jax.Array, count: int, width: int) -> jax.Array:
 
 
 def _flat(tree: Any) -> np.ndarray:
-    return np.concatenate([_tensor(leaf).numpy().ravel() for leaf in jax.tree.leaves(tree)])
-
-
-def _tensor(array: Any) -> torch.Tensor:
-    """A copy; indices as PyTorch wants them."""
-    array = array.detach().clone() if isinstance(array, torch.Tensor) else torch.tensor(np.asarray(array))
-    return array if array.is_floating_point() else array.long()
+    return np.concatenate([tensor(leaf).cpu().numpy().ravel() for leaf in jax.tree.leaves(tree)])
 
 
 def _cosine(done: int, steps: int) -> float:

@@ -2,23 +2,21 @@
 
     python -m benchmarks._transitions '{"labels": 19, "people": 80, "count": 300000, "pace": "performed", ...}'
 
-`benchmarks.motion` starts that process: its peak of memory is the pass's alone. It prints one line of JSON.
+`benchmarks.augment` starts that process: its peak of memory is the pass's alone. It prints one line of JSON.
 """
 
 from __future__ import annotations
 
 import json
-import re
-import resource
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import _machine
 from facejax import augment
 from facejax.data.motions import Motions
 from facejax.geometry import sphere, srvf
@@ -76,7 +74,7 @@ def stream(*, count: int, pace: str, **sizes: int) -> dict[str, float]:
     """One pass over `count` transitions that keeps none: its time, and the peak of memory before and after, in MB."""
     motions, pairs = problem(count, **sizes)
     jax.block_until_ready(motions)
-    before, options = _peak(), {"frames": motions.q.shape[1] + 1, "pace": pace, "chunk": CHUNK}
+    before, options = _machine.peak_mb(), {"frames": motions.q.shape[1] + 1, "pace": pace, "chunk": CHUNK}
 
     def walk(pairs: np.ndarray) -> float:
         begun = time.perf_counter()
@@ -85,8 +83,7 @@ def stream(*, count: int, pace: str, **sizes: int) -> dict[str, float]:
         return time.perf_counter() - begun
 
     first, seconds = walk(pairs[:CHUNK]), walk(pairs)
-    times = {"first_s": first, "per_s": count / seconds, "minutes": seconds / 60}
-    return times | {"before_mb": before, "memory_mb": _peak()}
+    return {"first_s": first, "seconds": seconds, "before_mb": before, "memory_mb": _machine.peak_mb()}
 
 
 @jax.jit
@@ -128,14 +125,6 @@ def _in_numpy(motions: augment.Motions, pairs: np.ndarray) -> np.ndarray:
     starts = (side.start.reshape(count, 1, -1) for side in (first, second))
     start = sum(share[..., None] * side for share, side in zip((1 - tau, tau), starts, strict=True))
     return (start + np.exp(log_length)[..., None] / steps * moves).reshape(count, steps + 1, -1, 3)
-
-
-def _peak() -> float:
-    """Of this process's memory, in MB."""
-    status = Path("/proc/self/status")
-    if status.exists():  # Linux's `ru_maxrss` does not start anew with a process: it holds the parent's peak too
-        return int(re.search(r"VmHWM:\s+(\d+)", status.read_text())[1]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 if __name__ == "__main__":

@@ -1,9 +1,13 @@
-"""From labels to 30 meshes: once compiled, in a fresh process, and in a fresh process with a warm compilation cache.
+"""From labels to meshes: once compiled, in a fresh process, and in a fresh process with a warm compilation cache.
 
-    python -m benchmarks.pipeline [--json FILE]
+    python -m benchmarks.pipeline [--json FILE] [--quick]
 
-As released, by the linear answer alone (`refined=False`), and by S2D-Dec of the same hierarchy. What a face that was
-not seen before costs once is told apart. About a minute.
+* `labels_to_meshes_b16`, `_b1`: so many requests of 30 meshes of 3,260 vertices at once, as released.
+* `_linear`: by the linear answer alone (`refined=False`), `_s2d`: by S2D-Dec of the same hierarchy.
+* `new_face`: what a face that was not seen before costs once.
+* `fresh_process_*`: from the first import to 30 meshes, with nothing compiled and with the cache warm; once each.
+
+There is no peer: nothing else does this. Costs against size: 1 to 256 requests. About a minute.
 """
 
 from __future__ import annotations
@@ -15,62 +19,66 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 import jax
-import tyro
 
-from benchmarks import _measure
+from benchmarks import _measure, _sizes
 from facejax import pipeline
 from facejax.models import decoder, gpmm
 
+LABELS, FRAMES = ["neutral", "high_smile"], 30
 FRESH = """
-import time
-begun = time.perf_counter()
 import jax
-from facejax import pipeline, results
-results.compile_cache()
+from facejax import pipeline, runtime
+runtime.start()
 models = pipeline.load()
 landmarks = pipeline.landmarks(models, jax.random.key(0), ["neutral", "high_smile"], models.face.vertices)
 jax.block_until_ready(pipeline.meshes(models, landmarks, models.face.vertices))
-print(time.perf_counter() - begun)
 """
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    json: Path | None = None
-    """Also write the rows here."""
-    quick: bool = False
-    """Fewer repeats."""
+class Config(_measure.Options):
+    """What to measure."""
+
+    requests: tuple[int, ...] = (16, 1)
+    """At once."""
+    along_requests: tuple[int, ...] = (1, 4, 16, 64, 256)
+    """At which the cost of the linear answer and of S2D-Dec is measured; as released up to the third."""
 
 
-def run(config: Config) -> list[dict]:
-    """Rows of the table."""
+def run(config: Config) -> _measure.Found:
+    """Rows of the tables."""
     models = pipeline.load()
-    neutral, labels = models.face.vertices, ["neutral", "high_smile"]
-
     spiral = models._replace(decoder=decoder.init(jax.random.key(0), models.hierarchy))
-
-    def made(models, samples, **options):
-        landmarks = pipeline.landmarks(models, jax.random.key(0), labels, neutral, samples=samples)
-        return pipeline.meshes(models, landmarks, neutral, **options)
-
-    ways = {"refined": (models, {}), "linear": (models, {"refined": False}), "s2d": (spiral, {})}
-    calls = {
-        f"{way}_{samples}x30_meshes": functools.partial(made, of, samples, **options)
-        for way, (of, options) in ways.items()
-        for samples in (1, 16)
-    }
-    calls["new_face"] = lambda: gpmm.on_face(models.decoder.base, neutral)
-    found = _measure.interleaved(calls, repeats=5 if config.quick else 20)
-    rows = [{"name": name, **times} for name, times in found.items()]
-    for row in rows[:-1]:
-        row["meshes_per_s"] = 30 * (16 if "_16x" in row["name"] else 1) / row["median_s"]
+    ways = {"": (models, {}), "_linear": (models, {"refined": False}), "_s2d": (spiral, {})}
+    rows, repeats = [], 5 if config.quick else 15
+    for way, (of, options) in ways.items():
+        for samples in config.requests:
+            sides = {"facejax": functools.partial(made, of, samples, **options)}
+            count = samples * FRAMES
+            name = f"labels_to_meshes{way}_b{samples}"
+            rows.append(_measure.row(name, sides, repeats=repeats, items=count, unit="meshes"))
+    neutral = models.face.vertices
+    rows.append(_measure.row("new_face", {"facejax": lambda: gpmm.on_face(models.decoder.base, neutral)}, repeats=5))
     with tempfile.TemporaryDirectory() as folder:
         for name in ("fresh_process_empty_cache", "fresh_process_warm_cache"):
-            rows.append({"name": name, "first_s": _fresh(folder)})
-    return rows
+            seconds = _fresh(folder)
+            times = dict.fromkeys(("first_s", "min_s", "median_s"), seconds)
+            rows.append(_measure.lone(name, times, items=FRAMES, unit="meshes"))
+    sizes = []
+    for way, (of, options) in {} if config.quick else ways.items():
+        along = config.along_requests if way else config.along_requests[:3]
+        make = lambda count, of=of, options=options: functools.partial(made, of, count, **options)  # noqa: E731
+        sizes += _sizes.along(f"labels_to_meshes{way}", "requests", along, make, repeats=3)
+    return rows, sizes
+
+
+def made(models: pipeline.Models, samples: int, **options: bool) -> jax.Array:
+    """So many motions of one pair of labels, as meshes."""
+    neutral = models.face.vertices
+    landmarks = pipeline.landmarks(models, jax.random.key(0), LABELS, neutral, samples=samples)
+    return pipeline.meshes(models, landmarks, neutral, **options)
 
 
 def _fresh(folder: str) -> float:
@@ -82,5 +90,4 @@ def _fresh(folder: str) -> float:
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Config, prog="python -m benchmarks.pipeline", description=__doc__)
-    _measure.report(run(options), options.json)
+    _measure.main("pipeline", Config, run)

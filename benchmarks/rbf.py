@@ -2,67 +2,67 @@
 
     python -m benchmarks.rbf [--json FILE] [--quick]
 
-`full` is everything from a new face to its motion: fit, weights, warp. SciPy's RBFInterpolator takes all 405 channels
-in one call. Seo & Luo (2021) solve for every frame: `refit_per_frame` is that, `scipy_per_frame` too. What is compared
-gives the same displacements, which is checked first. Then the cost against the number of vertices, unless --quick.
+* `rbf_135x10000`: everything from a new face to its motion: the system, weights, all frames. SciPy's RBFInterpolator
+  takes all 405 channels in one call. `weights and warp` leaves out the system, `warp` is what another motion of the
+  same face costs.
+* `rbf_refit_135x10000`: the same beside Seo & Luo's (2021) way, a new system for every frame, by SciPy. `refit` is ours
+  of that kind.
 
-SciPy's one call does the same sums in float64. With one BLAS thread (OPENBLAS_NUM_THREADS=1) it takes about as long as
-`full`; where other work holds the cores, its many threaded calls wait for one another, and it takes several times as
-long. About two minutes.
+What is compared gives the same displacements, which is checked first. SciPy's calls work in float64 throughout, ours in
+float64 up to the weights. Costs against size: vertices 1,000 to 100,000 and frames 10 to 1,000. About a minute.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from pathlib import Path
 
 import jax
 import numpy as np
-import tyro
 from scipy.interpolate import RBFInterpolator
 
-from benchmarks import _measure
+from benchmarks import _equal, _measure, _sizes
 from facejax.data import makehuman
 from facejax.geometry import rbf
 
-SIZES = (1_000, 3_000, 10_000, 30_000, 100_000)
-
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    json: Path | None = None
-    """Also write the rows here."""
-    quick: bool = False
-    """Fewer repeats, one size."""
+class Config(_measure.Options):
+    """What to measure."""
+
     vertices: int = 10_000
     """Of the mesh."""
     frames: int = 135
     """Of the motion: SL21's sequences."""
+    along_vertices: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)
+    """At which the cost is measured."""
+    along_frames: tuple[int, ...] = (10, 30, 100, 300, 1000)
+    """At which the cost is measured."""
 
 
-def run(config: Config) -> list[dict]:
-    """Rows of the table."""
+def run(config: Config) -> _measure.Found:
+    """Rows of the tables."""
     rest, vertices, moved = _problem(config.vertices, config.frames)
     found = rbf.fit(rest)
-    weights = rbf.weights(found, vertices)
+    weights = jax.device_put(rbf.weights(found, vertices))
     once = {
-        "full": lambda: rbf.apply(rbf.fit(rest), moved, vertices),
-        "weights_and_warp": lambda: rbf.apply(found, moved, vertices),
+        "facejax": lambda: rbf.apply(rbf.fit(rest), moved, vertices),
+        "weights and warp": lambda: rbf.apply(found, moved, vertices),
         "warp": lambda: rbf.warp(weights, moved),
-        "scipy_one_call": lambda: _scipy(rest, moved, vertices, found.unit),
+        "SciPy": lambda: _scipy(rest, moved, vertices, found.unit),
     }
     units = [rbf.fit(rest + before).unit for before in _before(moved)]
-    each = {
-        "refit_per_frame": lambda: rbf.refit(rest, moved, vertices),
-        "scipy_per_frame": lambda: _scipy_refit(rest, moved, vertices, units),
-    }
-    for group in (once, each):
-        _check_equal(group)
-    rows = _rows(once | each, 3 if config.quick else 9, vertices=config.vertices, frames=config.frames)
-    for size in () if config.quick else SIZES:
-        rows += _size(size, config.frames)
-    return rows
+    refit = lambda: rbf.refit(rest, moved, vertices)  # noqa: E731
+    each = {"SciPy, each frame": lambda: _scipy_refit(rest, moved, vertices, units)}
+    for side in list(once)[1:]:
+        _equal.check(once["facejax"](), once[side]())
+    _equal.check(refit(), each["SciPy, each frame"]())
+    name, options = f"{config.frames}x{config.vertices}", {"items": config.frames, "unit": "frames"}
+    repeats = 7 if config.quick else 25
+    rows = [_measure.row(f"rbf_{name}", once, peers=["SciPy"], repeats=repeats, **options)]
+    sides = {"facejax": once["facejax"], "refit": refit} | each
+    rows.append(_measure.row(f"rbf_refit_{name}", sides, peers=list(each), repeats=5, **options))
+    return rows, [] if config.quick else _by_size(config)
 
 
 def _problem(count: int, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,41 +96,14 @@ def _scipy_refit(rest: np.ndarray, moved: np.ndarray, vertices: np.ndarray, unit
     return np.stack(out)
 
 
-def _check_equal(functions: dict[str, Callable]) -> None:
-    """A fast wrong answer is no answer."""
-    expected, *others = (np.asarray(function()) for function in functions.values())
-    for other in others:
-        np.testing.assert_allclose(other, expected, atol=1e-4)
+def _by_size(config: Config) -> list[dict]:
+    def whole(vertices: int, frames: int) -> Callable:
+        rest, points, moved = _problem(vertices, frames)
+        return lambda: rbf.apply(rbf.fit(rest), moved, points)
 
-
-def _rows(functions: dict[str, Callable], repeats: int, **about: int) -> list[dict]:
-    found = _measure.interleaved(functions, repeats=repeats)
-    full = found["full"]["median_s"]
-    return [
-        {
-            "name": name,
-            **about,
-            **{key.replace("_s", "_ms"): 1e3 * value for key, value in times.items()},
-            "ms_per_frame": 1e3 * times["median_s"] / about["frames"],
-            "over_full": times["median_s"] / full,
-        }
-        for name, times in found.items()
-    ]
-
-
-def _size(size: int, frames: int) -> list[dict]:
-    """`full`, its parts and SciPy's one call on another number of vertices."""
-    rest, vertices, moved = _problem(size, frames)
-    found = rbf.fit(rest)
-    weights = jax.device_put(rbf.weights(found, vertices))
-    functions = {
-        "full": lambda: rbf.apply(rbf.fit(rest), moved, vertices),
-        "warp": lambda: rbf.warp(weights, moved),
-        "scipy_one_call": lambda: _scipy(rest, moved, vertices, found.unit),
-    }
-    return _rows(functions, 5, vertices=size, frames=frames)
+    rows = _sizes.along("rbf", "vertices", config.along_vertices, lambda count: whole(count, config.frames))
+    return rows + _sizes.along("rbf", "frames", config.along_frames, lambda count: whole(config.vertices, count))
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Config, prog="python -m benchmarks.rbf", description=__doc__)
-    _measure.report(run(options), options.json)
+    _measure.main("rbf", Config, run)

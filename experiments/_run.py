@@ -23,7 +23,7 @@ import jax
 import numpy as np
 import tyro
 
-from facejax import files, results
+from facejax import files, runtime
 
 PREPARES = "The first run prepares makehuman4d in the user's cache: some 4 minutes and 0.8 GB a level."
 RESULTS = Path(__file__).parent / "results"
@@ -36,7 +36,7 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
     if "meshes" in {field.name for field in dataclasses.fields(config_type)}:
         description += f"\n{PREPARES}"
     config = tyro.cli(config_type, prog=f"python -m experiments.{name}", description=description)
-    results.compile_cache()
+    runtime.start()
     try:
         _check_publish(config)
         run(config)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import _cases, _run, _scored
-from facejax import evaluation, expressions, files, fit_expressions, journal
+from facejax import evaluation, expressions, files, fit_expressions, journal, runtime
 from facejax.data import makehuman4d, performance, sequences, store
 from facejax.fit_expressions import PAPER, ExpressionPlan
 from facejax.models import sequence
@@ -209,4 +209,5 @@ def _networks(config: Config, variant: Variant, params: sequence.Params) -> expr
 
 
 if __name__ == "__main__":
+    runtime.every_core()
     _run.main("expression_lstm", Config, run)

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import files, io, pipeline, results
+from facejax import files, io, pipeline, results, runtime
 from facejax.data import makehuman
 from facejax.io import render
 
@@ -24,7 +24,7 @@ PICTURE = (200, 250)
 def run(out: Path, *, seed: int = 7) -> Path:
     """Three unseen faces through `LABELS`; returns the summary's path."""
     clock = _Clock()
-    results.compile_cache()
+    runtime.start()
     results.writable(out)
     people = [makehuman.subject(i) for i in SUBJECTS]
     clock.lap("MakeHuman's assets and three faces")

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import animation, drive, files, io, pipeline, results, scanned
+from facejax import animation, drive, files, io, pipeline, results, runtime, scanned
 from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait, store
 from facejax.io import dress, faces
 
@@ -32,7 +32,7 @@ def generate(
     `frames` as in `pipeline.landmarks`, or "natural": as long as people take, generated with the first sample. What is
     `worn` on this neutral face, a scan, is what moves.
     """
-    results.compile_cache()
+    runtime.start()
     models = pipeline.load(model)
     pipeline.label_indices(models, labels)
     if worn is not None and not np.array_equal(models.face.faces, assets.load().faces):
@@ -109,7 +109,7 @@ def fit(data: Path, out: Path, *, quick: bool = False, seed: int = 0) -> tuple[P
     """
     from facejax import fit_models, fit_motion, fit_residual
 
-    results.compile_cache()
+    runtime.start()
     found = store.open_store(data)
     fit_models.check(found)
     if out.suffix != ".safetensors":
@@ -180,7 +180,7 @@ def animate(
 
     `options` go to `animation.prepare` (pin, kernel, sigma, smoothing).
     """
-    results.compile_cache()
+    runtime.start()
     results.check_formats(formats)
     rate = motion.fps if fps is None else fps
     results.check_rate(rate)

@@ -10,22 +10,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import jax
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from facejax import files, io, pipeline
-from facejax.data import cache
 from facejax.io import dress, film
 
 FILM_RATE = 15.0  # frames per second of films: half the motion's, since drawing dominates the time
-
-
-def compile_cache() -> None:
-    """Keep compiled programs in the user's cache: the second start is then quick."""
-    jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "compiled"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def check_formats(formats: Sequence[str]) -> None:

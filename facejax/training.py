@@ -110,7 +110,7 @@ def run(
         if not resume and checkpoints.latest() is not None:
             raise ValueError(f"{folder} holds a run of {checkpoints.latest()} steps: resume it, or name another folder")
         # Copied, since the first chunk would donate the caller's own arrays.
-        state = jax.tree.map(jnp.copy, state) if checkpoints.latest() is None else checkpoints.restore(state)
+        state = jax.tree.map(jnp.copy, state) if checkpoints.latest() is None else _unbound(checkpoints.restore(state))
         done = saved = int(state.step)
         saved_at = time.monotonic()
         with Journal(folder, done, steps, tensorboard=tensorboard) as journal:
@@ -131,7 +131,19 @@ def run(
                     saved, saved_at = done, time.monotonic()
     if stopped:
         raise KeyboardInterrupt if stopped[0] == signal.SIGINT else SystemExit(128 + stopped[0])
-    return state
+    return _unbound(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
+
+
+def _unbound(state: TrainState) -> TrainState:
+    """Copies that belong to no device in particular, as new arrays do: a step may run on one or on several."""
+
+    def unbound(leaf: jax.Array) -> jax.Array:
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            data = jnp.asarray(np.asarray(jax.random.key_data(leaf)))
+            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+        return jnp.asarray(np.asarray(leaf))
+
+    return jax.tree.map(unbound, state)
 
 
 def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int | None, folder: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from facejax import journal, steps, training
 
+ROOT = Path(__file__).parents[1]
 DATA = np.random.default_rng(0).standard_normal((50, 4)).astype(np.float32)
 OPTIMISER = optax.adam(1e-2)
 
@@ -366,3 +367,12 @@ def test_models_side_by_side_resume_to_the_same_numbers(tmp_path):
     whole = apart([0, 2], 12, tmp_path / "whole")
     apart([0, 2], 8, tmp_path / "parts")
     assert same(apart([0, 2], 12, tmp_path / "parts"), whole)
+
+
+def test_several_devices_share_the_models():
+    """The tests above once more, where two networks have a device each, and three have one for all."""
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:xdist", __file__, "-k", "models_side_by_side"]
+    found = subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags}, cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stdout
+    assert "3 passed" in found.stdout

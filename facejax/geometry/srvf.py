@@ -25,6 +25,8 @@ from facejax.geometry.sphere import root
 FLOOR = 1e-12
 """Length below which a curve stands still, in the curve's unit."""
 
+BLOCK = 32  # steps
+
 
 @jax.jit
 def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -34,14 +36,15 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
     than two frames, on a last axis that is not 3, or on a dtype that is not floating.
     """
     _check(curve, "curve", "T", 2)
-    steps = jnp.diff(curve, axis=-3)
+    flat = _flat(curve)
+    steps = flat[..., 1:, :] - flat[..., :-1, :]
     # q does not depend on the scale of the steps, and the length is proportional to it. So both may be
     # computed on steps divided by their largest entry, held constant: values and gradients are the same, and
     # no square leaves the range of float32, however small the unit.
-    largest = lax.stop_gradient(jnp.max(jnp.abs(steps), axis=(-3, -2, -1)))
+    largest = lax.stop_gradient(jnp.max(jnp.abs(steps), axis=(-2, -1)))
     scale = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
-    steps = steps / _wide(scale)
-    squared = jnp.sum(steps**2, axis=(-2, -1))
+    steps = steps / scale[..., None, None]
+    squared = jnp.sum(steps**2, axis=-1)
     # Below this a step is less than the rounding of the largest, and the powers of its gradient would
     # overflow.
     moved = squared > jnp.finfo(squared.dtype).tiny ** 0.5
@@ -50,8 +53,8 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
     moving = scale * relative > FLOOR
     relative = jnp.where(moving, relative, 1)
     kept = moved & moving[..., None]
-    factor = jnp.sqrt(steps.shape[-3] / (jnp.where(kept, norms, 1) * relative[..., None]))
-    q = jnp.where(kept, factor, 0)[..., None, None] * steps
+    factor = jnp.sqrt(steps.shape[-2] / (jnp.where(kept, norms, 1) * relative[..., None]))
+    q = (jnp.where(kept, factor, 0)[..., None] * steps).reshape(*steps.shape[:-1], *curve.shape[-2:])
     return q, jnp.where(moving, jnp.log(scale) + jnp.log(relative), jnp.log(FLOOR))
 
 
@@ -65,8 +68,8 @@ def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
     _check(q, "q", "T-1", 1)
     if jnp.shape(start)[-2:] != q.shape[-2:]:
         raise ValueError(f"start: expected (..., L, 3) with L = {q.shape[-2]}, got shape {jnp.shape(start)}")
-    steps = displacement(q, log_length)
-    moved = jnp.concatenate([jnp.zeros_like(steps[..., :1, :, :]), jnp.cumsum(steps, axis=-3)], axis=-3)
+    flat, pace = _flat(q), _pace(q, log_length)
+    moved = _running(pace, flat).reshape(*flat.shape[:-2], flat.shape[-2] + 1, *q.shape[-2:])
     return jnp.asarray(start)[..., None, :, :] + moved
 
 
@@ -74,10 +77,7 @@ def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
 def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
     """The steps (..., T-1, L, 3) between frames, exp(log_length) q|q| / (T-1), for q (..., T-1, L, 3)."""
     _check(q, "q", "T-1", 1)
-    # q|q| is differentiable at 0, with derivative 0, and the safe root gives just that.
-    norms = root(jnp.sum(q**2, axis=(-2, -1)))
-    pace = jnp.exp(jnp.asarray(log_length))[..., None] * norms / q.shape[-3]
-    return pace[..., None, None] * q
+    return _pace(q, log_length)[..., None, None] * q
 
 
 @jax.jit
@@ -111,6 +111,34 @@ def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
         raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
 
 
-def _wide(scalars: jax.Array) -> jax.Array:
-    """One number per curve (...) -> (..., 1, 1, 1)."""
-    return scalars[..., None, None, None]
+def _flat(curve: jax.Array) -> jax.Array:
+    """(..., T, L, 3) -> (..., T, 3 L): XLA's code for a CPU is slow where the last axis is short."""
+    return curve.reshape(*curve.shape[:-2], 3 * curve.shape[-2])
+
+
+def _pace(q: jax.Array, log_length: jax.Array) -> jax.Array:
+    """What a step is of its q, exp(log_length) |q| / (T-1): (..., T-1)."""
+    # q|q| is differentiable at 0, with derivative 0, and the safe root gives just that.
+    norms = root(jnp.sum(_flat(q) ** 2, axis=-1))
+    return jnp.exp(jnp.asarray(log_length))[..., None] * norms / q.shape[-3]
+
+
+def _running(pace: jax.Array, q: jax.Array) -> jax.Array:
+    """Sums (..., T, D) over the first 0, 1, ..., T-1 steps pace (..., T-1) times q (..., T-1, D).
+
+    A product with a triangle of ones, which takes a tenth of a running sum's time on a CPU (1,000 motions of 30 frames:
+    2 ms instead of 22). Longer motions go block by block.
+    """
+    count = q.shape[-2]
+    if count <= BLOCK:
+        earlier = jnp.tril(jnp.ones((count + 1, count), q.dtype), -1)
+        return jnp.einsum("...ft,...td->...fd", earlier * pace[..., None, :], q, precision=lax.Precision.HIGHEST)
+    blocks = -(-count // BLOCK)
+    spare = [(0, 0)] * (q.ndim - 2) + [(0, blocks * BLOCK - count)]
+    q = jnp.pad(q, [*spare, (0, 0)]).reshape(*q.shape[:-2], blocks, BLOCK, q.shape[-1])
+    pace = jnp.pad(pace, spare[-pace.ndim :]).reshape(*pace.shape[:-1], blocks, BLOCK)
+    within = _running(pace, q)
+    before = jnp.cumsum(within[..., -1:, :], axis=-3) - within[..., -1:, :]
+    sums = (before + within[..., :-1, :]).reshape(*within.shape[:-3], blocks * BLOCK, within.shape[-1])
+    end = before[..., -1, :, :] + within[..., -1, -1:, :]
+    return jnp.concatenate([sums, end], axis=-2)[..., : count + 1, :]

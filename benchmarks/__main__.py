@@ -1,0 +1,158 @@
+"""All benchmarks, each in a process of its own; and what got slower since the committed baseline.
+
+    python -m benchmarks [--quick] [--only NAME ...] [--runs N] [--publish] [--out FOLDER]
+    python -m benchmarks compare [FILE.json ...] [--quick] [--only NAME ...]
+
+The first writes FOLDER/NAME.json, table.md and sizes.png; with --publish also benchmarks/results and the baseline,
+whose tolerances come of --runs whole runs. The second runs them anew, or takes the files, and ends with exit code 1
+where a ratio to a peer has fallen by more than its tolerance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from benchmarks import _compare, _measure, _sizes
+from facejax import files
+
+ROOT = Path(__file__).parents[1]
+RESULTS = Path(__file__).with_name("results")
+NAMES = ("srvf", "augment", "motion", "lstm", "decoder", "rbf", "linear", "pipeline", "data")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to run."""
+
+    quick: bool = False
+    """Fewer repeats, and no costs against size."""
+    only: tuple[str, ...] = ()
+    """Some of them, by name."""
+    runs: int = 1
+    """Whole runs, one after another; the last one's figures are shown, all count for the baseline's tolerances."""
+    publish: bool = False
+    """Write benchmarks/results and benchmarks/baseline.json too."""
+    name: str = "cpu"
+    """Of the published files; only `cpu` is the baseline."""
+    out: Path = Path("runs/benchmarks")
+    """Folder for the figures."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Compare:
+    """What to compare with the baseline."""
+
+    given: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Files that benchmarks wrote; without them they are run."""
+    quick: bool = False
+    """Fewer repeats."""
+    only: tuple[str, ...] = ()
+    """Some of them, by name."""
+    baseline: Path = _compare.BASELINE
+    out: Path = Path("runs/benchmarks")
+    """Folder for the figures of a run."""
+
+
+def main(arguments: list[str]) -> int:
+    """The exit code."""
+    comparing = arguments[:1] == ["compare"]
+    kind, rest = (Compare, arguments[1:]) if comparing else (Config, arguments)
+    config = tyro.cli(kind, prog="python -m benchmarks" + " compare" * comparing, description=__doc__, args=rest)
+    try:
+        return compare(config) if comparing else everything(config)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"benchmarks: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+
+
+def everything(config: Config) -> int:
+    """Run, and write what was found."""
+    names = _chosen(config.only)
+    if config.publish and (config.quick or config.only):
+        raise ValueError("--publish writes what the README quotes: leave out --quick and --only")
+    runs = [_run(names, config.out, config.quick) for _ in range(config.runs)]
+    documents = runs[-1]
+    table, sizes = _written(documents, config.out)
+    print("\n" + table)
+    if config.publish:
+        _publish(config, runs, table, sizes)
+    return 0
+
+
+def compare(config: Compare) -> int:
+    """1 where something got slower than its own ratio."""
+    known = _compare.read(config.baseline)
+    if config.given:
+        rows = _compare.rows_of(config.given)
+    else:
+        rows = [row for document in _run(_chosen(config.only), config.out, config.quick) for row in document["rows"]]
+    print("\n" + _compare.table(rows, known["rows"]))
+    fallen = _compare.slower(rows, known["rows"])
+    if fallen:
+        print(f"\nslower than {config.baseline.name} tolerates: {', '.join(fallen)}")
+    return 1 if fallen else 0
+
+
+def _chosen(only: tuple[str, ...]) -> tuple[str, ...]:
+    if unknown := [name for name in only if name not in NAMES]:
+        raise ValueError(f"--only {' '.join(unknown)}: expected some of {', '.join(NAMES)}")
+    return only or NAMES
+
+
+def _run(names: tuple[str, ...], out: Path, quick: bool) -> list[dict[str, Any]]:
+    """Each in a process of its own, so that memory and caches are its own too."""
+    found = []
+    for name in names:
+        path = out / f"{name}.json"
+        command = [sys.executable, "-m", f"benchmarks.{name}", "--json", str(path.absolute())] + ["--quick"] * quick
+        print(f"benchmarks.{name}", file=sys.stderr, flush=True)
+        if code := subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL).returncode:
+            raise RuntimeError(f"benchmarks.{name} ended with exit code {code}; what it says stands above")
+        found.append(json.loads(path.read_text()))
+    return found
+
+
+def _written(documents: list[dict[str, Any]], out: Path) -> tuple[str, list[dict]]:
+    """The table and, where there are sizes, their plot."""
+    rows = [row for document in documents for row in document["rows"]]
+    sizes = [row for document in documents for row in document["sizes"]]
+    table = _measure.table(rows)
+    if sizes:
+        table += "\n\n" + _sizes.table(sizes)
+        _sizes.plot(sizes, out / "sizes.png")
+    table += "\n\n" + _made(documents) + "\n"
+    with files.replacing(out / "table.md") as temporary:
+        temporary.write_text(table)
+    return table, sizes
+
+
+def _made(documents: list[dict[str, Any]]) -> str:
+    about = documents[-1]["machine"]
+    limits, versions = about["roofline"], about["versions"]
+    libraries = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return (
+        f"{about['cores']} cores of {about['processor']} ({about['device']}), {limits['gflop_per_s']:.0f} GFLOP/s, "
+        f"{limits['gbyte_per_s']:.0f} GB/s; Python {about['python']}, {libraries}; commit {about['commit']}, "
+        f"{about['date']}, {sum(document['seconds'] for document in documents) / 60:.0f} minutes."
+    )
+
+
+def _publish(config: Config, runs: list[list[dict[str, Any]]], table: str, sizes: list[dict]) -> None:
+    _measure.write(RESULTS / f"{config.name}.json", {"benchmarks": runs[-1]})
+    with files.replacing(RESULTS / f"{config.name}.md") as temporary:
+        temporary.write_text(table)
+    _sizes.plot(sizes, RESULTS / f"{config.name}_sizes.png")
+    if config.name == "cpu":
+        rows = _compare.baseline([[row for document in run for row in document["rows"]] for run in runs])
+        _measure.write(_compare.BASELINE, {"machine": runs[-1][-1]["machine"], "rows": rows})
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,82 @@
+"""Cost against size: one work at several sizes along an axis, and the exponent of the power that its cost follows."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks import _timing
+
+Row = dict[str, Any]
+
+
+def along(
+    name: str, axis: str, sizes: Iterable[int], make: Callable[[int], Callable[[], Any]], *, repeats: int = 7
+) -> list[Row]:
+    """A row for each size: the work that `make(size)` returns, first call and steady."""
+    rows = []
+    for size in sizes:
+        (times,) = _timing.interleaved({name: make(size)}, repeats=repeats).values()
+        rows.append({"name": name, "axis": axis, "size": size, **times})
+        print(f"{name}, {size:,} {axis}: {times['median_s']:.4g} s", file=sys.stderr, flush=True)
+    return rows
+
+
+def exponent(rows: Sequence[Row]) -> float:
+    """Of the power of size that the upper half of the sizes follows, where constant costs no longer weigh."""
+    upper = sorted(rows, key=lambda row: row["size"])[len(rows) // 2 - 1 :]
+    size, cost = (np.log([row[key] for row in upper]) for key in ("size", "median_s"))
+    return float(np.polyfit(size, cost, 1)[0])
+
+
+def curves(rows: Iterable[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Rows by (axis, name), in the order of their first."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row["axis"], row["name"]), []).append(row)
+    return found
+
+
+def table(rows: Iterable[Row]) -> str:
+    """Each curve's least and largest size, and its exponent, as Markdown."""
+    lines = ["| work | axis | from | to | cost grows as |", "|" + " --- |" * 5]
+    for (axis, name), curve in curves(rows).items():
+        ends = (f"{row['size']:,}: {1e3 * row['median_s']:.3g} ms" for row in (curve[0], curve[-1]))
+        lines.append(f"| `{name}` | {axis} | {' | '.join(ends)} | {axis}^{exponent(curve):.2f} |")
+    return "\n".join(lines)
+
+
+def plot(rows: Iterable[Row], path: Path) -> None:
+    """A panel for each axis, both scales logarithmic."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from facejax import files
+
+    found = curves(rows)
+    axes = list(dict.fromkeys(axis for axis, _ in found))
+    figure, panels = plt.subplots(1, len(axes), figsize=(5 * len(axes), 4.5), squeeze=False, layout="constrained")
+    for axis, panel in zip(axes, panels[0], strict=True):
+        for (along_axis, name), curve in found.items():
+            if along_axis == axis:
+                sizes, cost = ([row[key] for row in curve] for key in ("size", "median_s"))
+                panel.loglog(sizes, [1e3 * t for t in cost], "o-", ms=3, label=f"{name}: {exponent(curve):.2f}")
+        low, high = panel.get_xlim()
+        floor = panel.get_ylim()[0]
+        guide = np.array([low, high])
+        panel.loglog(guide, floor * guide / low, ":", color="grey", lw=1, label="linear")
+        panel.set_xlim(low, high)
+        panel.set_ylim(bottom=10 ** math.floor(math.log10(floor)))
+        panel.set(xlabel=axis, ylabel="ms" if axis == axes[0] else "")
+        panel.legend(fontsize=7, title="work: exponent", title_fontsize=7)
+        panel.grid(alpha=0.3)
+    with files.replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+    plt.close(figure)

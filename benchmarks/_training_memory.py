@@ -1,0 +1,37 @@
+"""A training of S2D-Dec on 20,000 meshes, alone in a process whose peak of memory is the training's.
+
+    python -m benchmarks._training_memory
+
+`benchmarks.decoder` starts it. It prints one line of JSON: seconds a step, first chunk apart, and the peak in MB.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import tempfile
+from pathlib import Path
+
+from benchmarks import _machine
+from facejax import fit_decoder
+from facejax.data import makehuman, makehuman4d, meshes
+from facejax.mesh import topology
+
+CHUNK, CHUNKS = 50, 5  # of `fit_decoder.fit`
+
+
+def measure() -> dict[str, float]:
+    """Some chunks of steps, with batches read from disk as always."""
+    data = makehuman4d.prepare()
+    everybody = meshes.of_split(data, "train", "validation", "test")
+    hierarchy = topology.build(*makehuman.template()[:2])
+    with tempfile.TemporaryDirectory() as folder:
+        fit_decoder.fit(everybody, hierarchy, folder, plan=fit_decoder.Plan(steps=CHUNK * CHUNKS))
+        lines = Path(folder, "metrics.jsonl").read_text().splitlines()
+    first, *steady = [json.loads(line)["seconds"] / CHUNK for line in lines]
+    times = {"first_s": CHUNK * first, "min_s": min(steady), "median_s": statistics.median(steady)}
+    return times | {"meshes": everybody.count, "memory_mb": _machine.peak_mb()}
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure()))

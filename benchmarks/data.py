@@ -1,0 +1,111 @@
+"""Data on its way: batches of meshes from a store, recordings into a store, meshes from files.
+
+    python -m benchmarks.data [--json FILE] [--quick]
+
+* `mesh_batches_b16`: random batches of displacements as a training reads them, from a store on disk.
+* `read_ply`: a binary PLY of 5,023 vertices (CoMA's size) beside trimesh, `process=False`.
+* `prepare_2000`: `facejax data prepare folder` of 2,000 such files, every core at work, its start included.
+
+Files are made up and lie in the system's cache. About a minute.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from benchmarks import _equal, _measure
+from benchmarks.decoder import grid
+from facejax import fit_decoder, io
+from facejax.data import makehuman4d, meshes, store
+
+ROOT = Path(__file__).parents[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(_measure.Options):
+    """What to measure."""
+
+    vertices: int = 5023
+    meshes: int = 2000
+    """Files to prepare; --quick takes a tenth."""
+    batch: int = 16
+    store: Path | None = None
+    """A store to read batches from; by default makehuman4d, prepared first if it is not there."""
+
+
+def run(config: Config) -> _measure.Found:
+    """Rows of the table."""
+    rows, repeats = [], 5 if config.quick else 15
+    data = makehuman4d.prepare() if config.store is None else store.open_store(config.store)
+    everybody = meshes.of_split(data, "train")
+    read = fit_decoder.mesh_batches(everybody, config.batch, 0)
+    first = iter(range(0, 10**9, 10))
+    sides = {"facejax": lambda: read(next(first), 10)}
+    count = 10 * config.batch
+    rows.append(_measure.row(f"mesh_batches_b{config.batch}", sides, repeats=repeats, items=count, unit="meshes"))
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        files = _written(root / "raw", config)
+        sides = {
+            "facejax": lambda: io.load_mesh(files[0]).vertices,
+            "trimesh": lambda: trimesh.load(files[0], process=False).vertices,
+        }
+        _equal.check(*(side() for side in sides.values()))
+        rows.append(_measure.row("read_ply", sides, peers=["trimesh"], repeats=repeats, items=1, unit="meshes"))
+        rows.append(_prepared(root, len(files)))
+    return rows, []
+
+
+def _written(root: Path, config: Config) -> list[Path]:
+    """Recordings of 50 frames, ten for each subject, as binary PLY."""
+    rng = np.random.default_rng(0)
+    side = int(np.sqrt(config.vertices)) + 1
+    vertices, faces = grid(side)
+    keep = (faces < config.vertices).all(axis=1)
+    vertices, faces = vertices[: config.vertices], faces[keep]
+    total = config.meshes // 10 if config.quick else config.meshes
+    files = []
+    for number in range(total):
+        recording, frame = divmod(number, 50)
+        path = root / f"s{recording // 10:02}" / f"smile{recording % 10}" / f"{frame:03}.ply"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        moved = vertices + 0.1 * np.sin(np.pi * frame / 49) * rng.normal(size=vertices.shape)
+        trimesh.Trimesh(moved, faces, process=False).export(path)
+        files.append(path)
+    return files
+
+
+def _prepared(root: Path, count: int) -> _measure.Row:
+    """By the command line in a process of its own; every call into a folder of its own."""
+    np.savetxt(root / "landmarks.txt", np.linspace(0, 5000, 68).astype(int), fmt="%d")
+    command = [sys.executable, "-c", "from facejax.cli import main; main()", "data", "prepare", "folder"]
+    command += [
+        "--root",
+        root / "raw",
+        "--landmarks",
+        root / "landmarks.txt",
+        "--unit",
+        "mm",
+        "--meshes",
+        str(len(files)),
+    ]
+    calls = iter(range(10**9))
+
+    def ours() -> None:
+        out = root / f"store{next(calls)}"
+        found = subprocess.run([*command, "--out", out], cwd=ROOT, capture_output=True, text=True)
+        if found.returncode:
+            raise RuntimeError(f"data prepare failed: {found.stderr}")
+
+    return _measure.row(f"prepare_{count}", {"facejax": ours}, repeats=3, items=count, unit="meshes")
+
+
+if __name__ == "__main__":
+    _measure.main("data", Config, run)

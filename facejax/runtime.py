@@ -1,0 +1,51 @@
+"""What a program may set once, before it uses JAX: compiled programs that are kept, memory that is kept, every core.
+
+The command line, the experiments and the benchmarks do; a library that is imported changes nothing by itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+
+import jax
+
+from facejax.data import cache
+
+KEPT = (1 << 31) - 1  # bytes that stay with the process though nobody uses them
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
+
+
+def start() -> None:
+    """`compile_cache` and `keep_memory`."""
+    compile_cache()
+    keep_memory()
+
+
+def compile_cache() -> None:
+    """Keep compiled programs in the user's cache: the second start is then quick."""
+    jax.config.update("jax_compilation_cache_dir", str(cache.folder() / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def keep_memory() -> bool:
+    """Let glibc's allocator keep freed memory, and say whether it could be told.
+
+    By default it gives large arrays back to the system when they are freed, and the next one's pages are faulted in and
+    zeroed again, which can take longer than the arithmetic: 1,000 motions were encoded in 13 ms, and so in 3.4. At most
+    2 GB are kept; for processes on a CPU, where arrays of some 10 MB come and go. Elsewhere it does nothing.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except AttributeError:  # another C library
+        return False
+    return bool(mallopt(_MMAP_THRESHOLD, 1 << 30) and mallopt(_TRIM_THRESHOLD, KEPT))
+
+
+def every_core() -> None:
+    """Make every core of the processor a device of JAX: `steps.side_by_side` shares its models among them."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    jax.config.update("jax_num_cpu_devices", cores or 1)
