@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup demo test slow lint browser clean
+.PHONY: help setup demo test slow lint browser bench geomstats clean
 
 help:
 	@echo "make demo    set up, then animate three unseen faces into runs/demo"
@@ -12,6 +12,7 @@ help:
 	@echo "make slow    the slow tests, by hand"
 	@echo "make browser the tests that need Chromium and Node, see README"
 	@echo "make lint    ruff"
+	@echo "make bench   the benchmarks with their peers, a quarter of an hour"
 	@echo "make clean   remove the virtual environment and the runs"
 
 setup: $(STAMP)
@@ -39,5 +40,17 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+bench: setup geomstats
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench,experiments]"
+	$(BIN)/python -m benchmarks
+
+# It needs an older NumPy than the rest, and so an environment of its own.
+geomstats: .venv-geomstats/.installed
+
+.venv-geomstats/.installed:
+	$(PYTHON) -m venv .venv-geomstats
+	.venv-geomstats/bin/python -m pip install --quiet --disable-pip-version-check "geomstats==2.8.0" "numpy<2.4"
+	@touch $@
+
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) .venv-geomstats runs

@@ -100,12 +100,12 @@ def transition(
         raise ValueError(f"tau: expected (..., {frames}), one fraction per frame, got shape {tau.shape}")
     angle = theta[..., None] * tau
     a, b = jnp.cos(angle)[..., None], (tau * jnp.sinc(angle / jnp.pi))[..., None]
-    pp, pw, ww = (jnp.sum(x * y, axis=(-2, -1))[..., None, :] for x, y in ((q1, q1), (q1, w), (w, w)))
+    flat = [x.reshape(*x.shape[:-2], 3 * x.shape[-2]) for x in (q1, w)]  # a CPU is slow at rows of three
+    pp, pw, ww = (jnp.sum(x * y, axis=-1)[..., None, :] for x, y in ((flat[0],) * 2, flat, (flat[1],) * 2))
     # Rounding may leave the square of a step that cancels just below 0; the root takes it as 0.
     pace = sphere.root(a**2 * pp + 2 * a * b * pw + b**2 * ww)
-    weights = jnp.concatenate([a * pace, b * pace], axis=-1)
-    basis = jnp.concatenate(jnp.broadcast_arrays(q1, w), axis=-3)
-    moves = jnp.einsum("...ft,...tlc->...flc", weights, basis)
+    moves = sum(jnp.einsum("...ft,...td->...fd", part * pace, x) for part, x in zip((a, b), flat, strict=True))
+    moves = moves.reshape(*moves.shape[:-1], *q1.shape[-2:])
     log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])
     start = _between(tau[..., None, None], start1[..., None, :, :], start2[..., None, :, :])
     return start + (jnp.exp(log_length) / q1.shape[-3])[..., None, None] * moves

@@ -76,7 +76,8 @@ def exp(p: jax.Array, v: jax.Array) -> jax.Array:
 def log(p: jax.Array, q: jax.Array) -> jax.Array:
     """The tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
     _check(p, q)
-    return _combined(p, q, _log(p, q), 0.0)
+    along = _log(p, q)
+    return _wide(along.scale) * _tangent(p, q, along)
 
 
 @jax.jit
@@ -101,7 +102,7 @@ def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
     along = _log(p, q)
     way = jnp.asarray(tau, jnp.result_type(p, q)) * along.scale
     cosine, sinc = _cos_sinc(jnp.square(way) * along.squared)
-    return _combined(p, q, along._replace(scale=sinc * way), cosine)
+    return _wide(cosine) * p + _wide(sinc * way) * _tangent(p, q, along)
 
 
 @jax.jit
@@ -215,11 +216,10 @@ def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
     return sign, lean, jnp.maximum(inner(d, d) - lean * along, 0), cosine, own
 
 
-def _combined(p: jax.Array, q: jax.Array, along: _Along, offset: jax.Array | float) -> jax.Array:
-    """offset p + scale (q - sign p - lean p), which is the fixed direction instead at the antipode."""
+def _tangent(p: jax.Array, q: jax.Array, along: _Along) -> jax.Array:
+    """What is scaled."""
     found = (q - _wide(along.sign) * p) - _wide(along.lean) * p
-    found = jnp.where(_wide(along.antipode), _fixed_direction(p, along.own), found)
-    return _wide(offset) * p + _wide(along.scale) * found
+    return jnp.where(_wide(along.antipode), _fixed_direction(p, along.own), found)
 
 
 def _fixed_direction(p: jax.Array, own: jax.Array) -> jax.Array:
