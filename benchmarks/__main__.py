@@ -4,7 +4,7 @@
     python -m benchmarks compare [FILE.json ...] [--quick] [--only NAME ...]
 
 The first writes FOLDER/NAME.json, table.md and sizes.png; with --publish also benchmarks/results and the baseline,
-whose tolerances come of --runs whole runs. The second runs them anew, or takes the files, and ends with exit code 1
+whose tolerances come of --runs runs. The second runs them anew, or takes the files, and ends with exit code 1
 where a ratio to a peer has fallen by more than its tolerance.
 """
 
@@ -36,7 +36,7 @@ class Config:
     only: tuple[str, ...] = ()
     """Some of them, by name."""
     runs: int = 1
-    """Whole runs, one after another; the last one's figures are shown, all count for the baseline's tolerances."""
+    """One after another, quick ones but the last, whose figures are shown; all count for the baseline's tolerances."""
     publish: bool = False
     """Write benchmarks/results and benchmarks/baseline.json too."""
     name: str = "cpu"
@@ -77,7 +77,7 @@ def everything(config: Config) -> int:
     names = _chosen(config.only)
     if config.publish and (config.quick or config.only):
         raise ValueError("--publish writes what the README quotes: leave out --quick and --only")
-    runs = [_run(names, config.out, config.quick) for _ in range(config.runs)]
+    runs = [_run(names, config.out, config.quick or left > 0) for left in range(config.runs)[::-1]]
     documents = runs[-1]
     table, sizes = _written(documents, config.out)
     print("\n" + table)

@@ -11,5 +11,10 @@ import numpy as np
 def check(ours: Any, theirs: Any, *, tolerance: float = 1e-4) -> None:
     """Every array of two trees, PyTorch's tensors among them, equal to a part of its largest entry."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        a, b = (np.asarray(x.detach().cpu() if hasattr(x, "detach") else x) for x in (a, b))
+        a, b = host(a), host(b)
         np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * np.abs(a).max())
+
+
+def host(array: Any) -> np.ndarray:
+    """As NumPy has it, wherever it lies."""
+    return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)

@@ -35,6 +35,7 @@ def ready(threads: int | None = None) -> bool:
     torch.set_num_threads(threads or _machine.cores())
     torch.set_default_device(device())
     torch.set_float32_matmul_precision("highest")
+    torch.backends.cudnn.allow_tf32 = False  # an LSTM's products would be of ten bits, whatever the line above says
     return True
 
 

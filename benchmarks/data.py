@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from benchmarks import _equal, _measure
-from benchmarks.decoder import grid
+from benchmarks import _equal, _measure, _sheet
 from facejax import fit_decoder, io
 from facejax.data import makehuman4d, meshes, store
 
@@ -67,7 +66,7 @@ def _written(root: Path, config: Config) -> list[Path]:
     """Recordings of 50 frames, ten for each subject, as binary PLY."""
     rng = np.random.default_rng(0)
     side = int(np.sqrt(config.vertices)) + 1
-    vertices, faces = grid(side)
+    vertices, faces = _sheet.grid(side)
     keep = (faces < config.vertices).all(axis=1)
     vertices, faces = vertices[: config.vertices], faces[keep]
     total = config.meshes // 10 if config.quick else config.meshes
@@ -95,7 +94,9 @@ def _prepared(root: Path, count: int) -> _measure.Row:
         if found.returncode:
             raise RuntimeError(f"data prepare failed: {found.stderr}")
 
-    return _measure.row(f"prepare_{count}", {"facejax": ours}, repeats=3, items=count, unit="meshes")
+    return _measure.row(
+        f"prepare_{count}", {"facejax": ours}, repeats=1 if count < 1000 else 3, items=count, unit="meshes"
+    )
 
 
 if __name__ == "__main__":

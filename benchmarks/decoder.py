@@ -34,8 +34,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks import _equal, _measure, _sizes, _torch, _work
-from facejax import losses, steps
+from benchmarks import _equal, _measure, _sheet, _sizes, _torch, _work
+from facejax import losses, steps, training
 from facejax.mesh import topology
 from facejax.mesh.topology import Hierarchy
 from facejax.models import decoder
@@ -74,10 +74,10 @@ class Problem(NamedTuple):
 def run(config: Config) -> _measure.Found:
     """Rows of the tables."""
     with_torch, repeats = _torch.ready(config.threads), 7 if config.quick else 25
-    many, one = problem(config.side, config.batch), problem(config.side, 1)
-    rows = [_forward(many, with_torch, repeats), _forward(one, with_torch, 2 * repeats)]
-    rows += [_gradient(many, with_torch, repeats), _gradient(one, with_torch, repeats)]
-    rows.append(_step(many, with_torch, max(5, repeats // 2)))
+    problems = {batch: problem(config.side, batch) for batch in (config.batch, 1)}
+    rows = [_forward(given, with_torch, repeats) for given in problems.values()]
+    rows += [_gradient(given, with_torch, repeats) for given in problems.values()]
+    rows.append(_step(problems[config.batch], with_torch, max(5, repeats // 2)))
     if config.quick:
         return rows, []
     rows.append(_training())
@@ -86,7 +86,7 @@ def run(config: Config) -> _measure.Found:
 
 def problem(side: int, batch: int) -> Problem:
     """On a sheet of side^2 vertices."""
-    host = topology.build(*grid(side))
+    host = topology.build(*_sheet.grid(side))
     rng = np.random.default_rng(0)
     marks, target, weights = (
         jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((batch, 68, 3), (batch, side**2, 3), side**2)
@@ -114,15 +114,6 @@ def plain(params: decoder.Params, hierarchy: Hierarchy, displacements: jax.Array
         x = jnp.einsum("bvkc,vk->bvc", x[:, hierarchy.corners[level]], hierarchy.weights[level])
         x = jax.nn.elu(_plain_conv(x, hierarchy.spirals[level], conv))
     return scale.vertex_mean + scale.vertex_std * _plain_conv(x, hierarchy.spirals[0], last)
-
-
-def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """A bent square sheet of side^2 vertices."""
-    y, x = np.divmod(np.arange(side * side), side)
-    vertices = np.stack([x, y, 5 * np.sin(x / 9) * np.cos(y / 7)], axis=1)
-    i = np.arange(side * side).reshape(side, side)
-    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, 1:].ravel(), i[1:, :-1].ravel()
-    return vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def _plain_conv(x: jax.Array, spirals: jax.Array, conv: dict[str, jax.Array]) -> jax.Array:
@@ -162,32 +153,37 @@ def _gradient(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
 
 
 def _step(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
-    """The step of `facejax.fit_decoder`."""
+    step, state = training_step(given)
+    sides = {
+        "facejax": stepped(_work.scanned(step, SCAN), state, given),
+        "single": stepped(step, state, given),
+    }
+    theirs = _peers(given, "step") if with_torch else {}
+    for name in theirs:
+        peer, ours = _peer(given), stepped(step, state, given)
+        call = peer.step(peer.forward(_way(name)), *_data(given, 3))
+        for _ in range(3):
+            _equal.check(ours()["loss"], call())
+    return _row("s2d_train_step", given, sides, theirs, repeats, 3, calls={"facejax": SCAN})
+
+
+def training_step(given: Problem) -> tuple[training.Step, training.TrainState]:
+    """The step of `facejax.fit_decoder`, and where it starts."""
 
     def loss(trained, key, batch, constants):
         scale, hierarchy, weights = constants
         predicted = decoder.apply(decoder.Params(scale, trained), hierarchy, batch[0])
         return losses.s2d(predicted, batch[1], weights), {}
 
-    step = steps.supervised(loss, optax.adamw(PLAN["rate"], weight_decay=PLAN["weight_decay"]))
-    state = steps.start_supervised(given.params.weights, optax.adamw(**_adamw()), jax.random.key(0))
-    held = ((given.marks, given.target), (given.params.scale, given.hierarchy, given.weights))
-    sides = {
-        "facejax": _work.onward(_work.scanned(step, SCAN), state, *held),
-        "single": _work.onward(step, state, *held),
-    }
-    theirs = _peers(given, "step") if with_torch else {}
-    for way in theirs:
-        fresh = _peer(given)
-        call = fresh.step(_way(fresh, way), *_data(given, 3))
-        expected = _work.onward(step, state, *held)
-        for _ in range(3):
-            _equal.check(expected()["loss"], call())
-    return _row("s2d_train_step", given, sides, theirs, repeats, 3, calls={"facejax": SCAN})
+    optimiser = optax.adamw(PLAN["rate"], weight_decay=PLAN["weight_decay"])
+    state = steps.start_supervised(given.params.weights, optimiser, jax.random.key(0))
+    return steps.supervised(loss, optimiser), state
 
 
-def _adamw() -> dict[str, float]:
-    return {"learning_rate": PLAN["rate"], "weight_decay": PLAN["weight_decay"]}
+def stepped(step: training.Step, state: training.TrainState, given: Problem) -> Callable:
+    """A function that goes on with every call."""
+    constants = (given.params.scale, given.hierarchy, given.weights)
+    return _work.onward(step, state, (given.marks, given.target), constants)
 
 
 def _row(
@@ -213,8 +209,9 @@ def _data(given: Problem, count: int) -> list:
     return [_torch.tensor(array) for array in (given.marks, given.target, given.weights)[:count]]
 
 
-def _way(peer, name: str) -> Callable:
-    return peer.forward(name.split()[1].rstrip(","))
+def _way(side: str) -> str:
+    """Of a side's name: `torch rows, compiled`."""
+    return side.split()[1].rstrip(",")
 
 
 def _peers(given: Problem, task: str) -> dict[str, Callable]:

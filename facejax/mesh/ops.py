@@ -51,6 +51,17 @@ def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
         raise ValueError(f"the stencil has {expected} positions and vertices, got {(positions, count)}")
     if jax.default_backend() != "cpu" or positions * count * batch * out_channels <= _AT_ONCE:
         return spiral_conv_at_once(x, kernel, stencil)
+    return spiral_conv_by_position(x, kernel, stencil)
+
+
+@jax.jit
+def spiral_conv_by_position(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
+    """`spiral_conv`, the same, one position after another: what is gathered from stays in a CPU's cache.
+
+    Memory for M * B * O numbers. `spiral_conv` takes this form on a CPU, but for few numbers.
+    """
+    positions, channels, out_channels = kernel.shape
+    count, batch, _ = x.shape
     rows = x.reshape(count * batch, channels)
     if out_channels < _FEW_CHANNELS <= batch:
         flat_kernel = kernel.transpose(0, 2, 1).reshape(positions * out_channels, channels)

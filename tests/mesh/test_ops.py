@@ -36,7 +36,10 @@ def case(hierarchy, *, lift, batch, channels, out):
 SIZES = [(1, 4, 3), (8, 4, 3), (9, 5, 8), (3, 2, 12)]
 
 
-@pytest.mark.parametrize("conv", [ops.spiral_conv, ops.spiral_conv_at_once], ids=["by position", "at once"])
+FORMS = [ops.spiral_conv, ops.spiral_conv_by_position, ops.spiral_conv_at_once]
+
+
+@pytest.mark.parametrize("conv", FORMS, ids=["chosen", "by position", "at once"])
 @pytest.mark.parametrize(("batch", "channels", "out"), SIZES)
 @pytest.mark.parametrize("lift", [True, False])
 @pytest.mark.parametrize("hierarchy", [HIERARCHY, PADDED], ids=["full", "padded"])
