@@ -19,7 +19,7 @@ from typing import Any
 
 import tyro
 
-from benchmarks import _compare, _measure, _sizes
+from benchmarks import _compare, _headline, _measure, _sizes
 from facejax import files
 
 ROOT = Path(__file__).parents[1]
@@ -146,8 +146,10 @@ def _made(documents: list[dict[str, Any]]) -> str:
 
 def _publish(config: Config, runs: list[list[dict[str, Any]]], table: str, sizes: list[dict]) -> None:
     _measure.write(RESULTS / f"{config.name}.json", {"benchmarks": runs[-1]})
-    with files.replacing(RESULTS / f"{config.name}.md") as temporary:
-        temporary.write_text(table)
+    rows = [row for document in runs[-1] for row in document["rows"]]
+    for name, text in ((config.name, table), (f"{config.name}_headline", _headline.table(rows) + "\n")):
+        with files.replacing(RESULTS / f"{name}.md") as temporary:
+            temporary.write_text(text)
     _sizes.plot(sizes, RESULTS / f"{config.name}_sizes.png")
     if config.name == "cpu":
         rows = _compare.baseline([[row for document in run for row in document["rows"]] for run in runs])

@@ -62,8 +62,13 @@ def plot(rows: Iterable[Row], path: Path) -> None:
 
     found = curves(rows)
     axes = list(dict.fromkeys(axis for axis, _ in found))
-    figure, panels = plt.subplots(1, len(axes), figsize=(5 * len(axes), 4.5), squeeze=False, layout="constrained")
-    for axis, panel in zip(axes, panels[0], strict=True):
+    columns = min(3, len(axes))
+    lines = -(-len(axes) // columns)
+    size = (4.6 * columns, 4.0 * lines)
+    figure, panels = plt.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
+    for panel in panels.flat[len(axes) :]:
+        panel.axis("off")
+    for axis, panel in zip(axes, panels.flat, strict=False):
         for (along_axis, name), curve in found.items():
             if along_axis == axis:
                 sizes, cost = ([row[key] for row in curve] for key in ("size", "median_s"))
@@ -74,7 +79,7 @@ def plot(rows: Iterable[Row], path: Path) -> None:
         panel.loglog(guide, floor * guide / low, ":", color="grey", lw=1, label="linear")
         panel.set_xlim(low, high)
         panel.set_ylim(bottom=10 ** math.floor(math.log10(floor)))
-        panel.set(xlabel=axis, ylabel="ms" if axis == axes[0] else "")
+        panel.set(xlabel=axis, ylabel="ms")
         panel.legend(fontsize=7, title="work: exponent", title_fontsize=7)
         panel.grid(alpha=0.3)
     with files.replacing(path) as temporary:

@@ -1,6 +1,7 @@
 """Benchmarks run on a tiny configuration, without their peers, and write what they promise."""
 
 import json
+import re
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ from benchmarks import (
     __main__,
     _compare,
     _equal,
+    _headline,
     _machine,
     _measure,
     _roofline,
@@ -215,6 +217,18 @@ def test_the_committed_baseline_and_results_are_whole():
     assert {row["name"] for row in rows if row["ratio"] is not None} == set(known)
     assert {"s2d_forward_b16", "s2d_forward_b1", "s2d_train_step_b16"} <= set(known)
     assert _measure.table(rows) in (__main__.RESULTS / "cpu.md").read_text()
+
+
+def test_the_readme_quotes_the_figures_unchanged():
+    """A table between `<!-- benchmarks: NAME -->` and `<!-- end -->` is the one in benchmarks/results/NAME.md."""
+    readme = (__main__.ROOT / "README.md").read_text()
+    quoted = re.findall(r"<!-- benchmarks: (\w+) -->\n(.*?)\n<!-- end -->", readme, re.DOTALL)
+    assert {"cpu_headline", "h200_headline"} <= {name for name, _ in quoted}
+    for name, table in quoted:
+        assert table.strip() == (__main__.RESULTS / f"{name}.md").read_text().strip(), name
+    parts = json.loads((__main__.RESULTS / "cpu.json").read_text())["benchmarks"]
+    rows = [row for part in parts for row in part["rows"]]
+    assert _headline.table(rows) == (__main__.RESULTS / "cpu_headline.md").read_text().strip()
 
 
 # Each stage.
