@@ -206,8 +206,11 @@ def _fans(polygons) -> np.ndarray:
         corners = group.shape[1]
         if group.shape[0] and corners < 3:
             raise ValueError(f"a face has {corners} corners, expected three or more")
-        if not np.equal(np.trunc(group), group).all():
+        if group.dtype.kind == "f" and not np.equal(np.trunc(group), group).all():
             raise ValueError("a face names a vertex by a fraction")
+        if corners == 3:
+            triangles.append(group.astype(np.int64))
+            continue
         fan = [group[:, [0, i, i + 1]].astype(np.int64) for i in range(1, corners - 1)]
         triangles.append(np.stack(fan, 1).reshape(-1, 3) if fan else np.zeros((0, 3), np.int64))
     return np.concatenate(triangles)
