@@ -181,14 +181,16 @@ class Flow(Peer):
 def check(peer: Peer, advance: Callable, start: training.TrainState, rows: np.ndarray, held: Any) -> None:
     """A peer that does something else is none: three steps' metrics, and where weights and averages have gone."""
     state = jax.tree.map(jnp.copy, start)  # what is donated is the copy
-    for _ in range(3):
+    for step in range(3):
         draws = map(tensor, peer.draws(state, len(rows)))
         state, expected = advance(state, rows, held)
         found = peer.step(tensor(rows), draws)
         assert found.keys() == expected.keys(), (sorted(found), sorted(expected))
         for name, value in expected.items():
-            # Scores are of the order of 1 and their means may cancel: the third step's were up to 0.0012 apart.
-            np.testing.assert_allclose(found[name].item(), value, rtol=1e-3, atol=3e-3, err_msg=name)
+            # The first step has the same weights. Adam's rounding then parts them: means of scores of the order of 1
+            # may cancel, and the third step's were up to 0.0012 apart in four sets of data.
+            apart = 3e-3 if step else 1e-5
+            np.testing.assert_allclose(found[name].item(), value, rtol=1e-3, atol=apart, err_msg=name)
     # Adam's first steps are of one size however small a slope: where that is rounding alone, the sides may part.
     for ways in ((state.params, start.params, peer.weights), (state.extra, start.extra, peer.average)):
         ours, before, theirs = map(_flat, ways)
