@@ -97,8 +97,8 @@ def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
     circle.
     """
     _check(p, q)
-    # Neither the logarithm nor what it is made of is written to memory: two passes over p and q find four numbers, and
-    # a third makes the point.
+    # The logarithm is not written to memory: sums over p, q and their difference give its few numbers, and the point is
+    # made of the same arrays.
     along = _log(p, q)
     way = jnp.asarray(tau, jnp.result_type(p, q)) * along.scale
     cosine, sinc = _cos_sinc(jnp.square(way) * along.squared)
@@ -217,7 +217,7 @@ def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _tangent(p: jax.Array, q: jax.Array, along: _Along) -> jax.Array:
-    """What is scaled."""
+    """What `_Along.scale` scales, tangent at p: (..., T-1, L, 3)."""
     found = (q - _wide(along.sign) * p) - _wide(along.lean) * p
     return jnp.where(_wide(along.antipode), _fixed_direction(p, along.own), found)
 

@@ -117,8 +117,8 @@ def _layer(row: Weights, x: jax.Array) -> jax.Array:
 
 
 def _layer_forward(row: Weights, x: jax.Array):
-    # The gates lie in one buffer: what goes into each step is replaced by what came out, and the backward pass replaces
-    # that by its gradient. Stacked by the scan, each of the three would be a new one, filled twice.
+    # The gates lie in one buffer: what goes into each step is replaced by what came out. Stacked by the scan they would
+    # be a new one, filled twice.
     def advance(carry, t):
         hidden, cell, gates = carry
         hidden, after, (opened, bent) = _cell(_at(gates, t) + row["bias"] + hidden @ row["hidden"], cell)
