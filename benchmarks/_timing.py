@@ -12,26 +12,38 @@ from typing import Any
 
 import jax
 
-REST = 0.06  # seconds between turns: OpenBLAS and OpenMP keep threads spinning for up to 30 ms after their work
-TURN = (
-    0.03  # seconds: shorter work is repeated for so long, after as long untimed, since rested cores are slow at first
-)
+REST = 0.03  # seconds of which the process must have spent next to nothing before the next turn
+PATIENCE = 1.0  # seconds after which a turn begins anyway
+# Seconds. Shorter work is repeated for so long, after as long untimed, since rested cores are slow at first.
+TURN = 0.03
 
 
-def interleaved(
-    functions: Mapping[str, Callable[[], Any]], *, repeats: int = 20, rest: float = REST
-) -> dict[str, dict[str, float]]:
+def interleaved(functions: Mapping[str, Callable[[], Any]], *, repeats: int = 20) -> dict[str, dict[str, float]]:
     """First-call, minimum and median seconds of each function; results are waited for."""
     first = {name: _seconds(function) for name, function in functions.items()}
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repeats):
         for name, function in functions.items():
-            time.sleep(rest)
+            settle()
             times[name].append(_turn(function))
     return {
         name: {"first_s": first[name], "min_s": min(steady), "median_s": statistics.median(steady)}
         for name, steady in times.items()
     }
+
+
+def settle() -> None:
+    """Wait until the threads of whoever was last have come to rest.
+
+    OpenBLAS's and OpenMP's go on spinning for 0.1 s and more after their work, and take a core from whoever is next:
+    right after SciPy an RBF warp took 10 ms, a second later 5.
+    """
+    begun = time.monotonic()
+    while REST and time.monotonic() - begun < PATIENCE:
+        spent = time.process_time()
+        time.sleep(REST)
+        if time.process_time() - spent < 0.1 * REST:
+            return
 
 
 def _turn(function: Callable[[], Any]) -> float:

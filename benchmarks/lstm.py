@@ -6,7 +6,8 @@ Seo & Luo 2021: three layers of 128 and a dense layer, 135 frames, batches of 5 
 squared error; 204 numbers a frame: 68 landmarks.
 
 * `lstm_forward`, `lstm_gradient`, `lstm_train_step` of one network, from the same weights and data on both sides. Our
-  step is timed in one call of ten, as the training loop has it, and alone as `single`.
+  step is timed in one call of ten, as the training loop has it, and alone as `single`; its batch shared out among the
+  cores by `facejax.steps.data_parallel` where that goes evenly, and then on one device as `one device`.
 * `lstm_train_step_x6`: six networks by `facejax.steps.side_by_side`, shared among the cores, also one after another and
   under `vmap`, beside six steps of PyTorch.
 * `lstm_follow`: the network that reads its own output, beside the automatic gradient of its scan.
@@ -81,15 +82,20 @@ def _one(config: Config, batch: int, with_torch: bool, repeats: int) -> list[_me
     """One network: forward, gradient, training step."""
     data, weights = _data(config, batch), _weights(config, 0)
     slope = jax.jit(jax.grad(lambda weights, data: _loss(weights, None, data, ())[0]))
-    single = _work.onward(_step(), _start(weights), data, ())
+    shared = _shared(batch)
     tasks = {
         "forward": {"facejax": lambda: lstm.forward(weights, data.x)},
         "gradient": {"facejax": lambda: slope(weights, data)},
         "train_step": {
-            "facejax": _work.onward(_work.scanned(_step(), SCAN), _start(weights), data, ()),
-            "single": single,
+            "facejax": _work.onward(_work.scanned(shared or _step(), SCAN), _start(weights), data, ()),
+            "single": _work.onward(shared or _step(), _start(weights), data, ()),
         },
     }
+    calls = {"facejax": SCAN}
+    if shared:
+        _check_steps([_work.onward(step, _start(weights), data, ()) for step in (_step(), shared)])
+        tasks["train_step"]["one device"] = _work.onward(_work.scanned(_step(), SCAN), _start(weights), data, ())
+        calls["one device"] = SCAN
     theirs: dict[str, dict[str, Callable]] = {task: {} for task in tasks}
     if with_torch:
         from benchmarks import _lstm_torch
@@ -99,12 +105,12 @@ def _one(config: Config, batch: int, with_torch: bool, repeats: int) -> list[_me
         _equal.check(lstm.forward(weights, data.x), peer.forward(held)())
         _equal.check(slope(weights, data), _lstm_torch.as_weights(peer.gradient(held)()))
         _check_steps([_work.onward(_step(), _start(weights), data, ()), fresh.step(held)])
-        calls = {"forward": peer.forward, "gradient": peer.gradient, "train_step": peer.step}
-        theirs = {task: _torch.threaded("torch", call(held)) for task, call in calls.items()}
+        ways = {"forward": peer.forward, "gradient": peer.gradient, "train_step": peer.step}
+        theirs = {task: _torch.threaded("torch", way(held)) for task, way in ways.items()}
     forward, both, rows = _products(config, batch), _step_products(config, batch), []
     for (task, sides), gflop in zip(tasks.items(), (forward, both, both), strict=True):
-        calls = {"facejax": SCAN} if task == "train_step" else None
-        options = {"repeats": repeats, "calls": calls, "gflop": gflop, "items": batch, "unit": "sequences"}
+        several = calls if task == "train_step" else None
+        options = {"repeats": repeats, "calls": several, "gflop": gflop, "items": batch, "unit": "sequences"}
         peers = theirs[task]
         rows.append(_measure.row(f"lstm_{task}_b{batch}", sides | peers, peers=list(peers), batch=batch, **options))
     return rows
@@ -231,6 +237,12 @@ def _loss(weights: lstm.Weights, key, batch: Batch, constants):
 
 def _step() -> training.Step:
     return steps.supervised(_loss, optax.adam(RATE))
+
+
+def _shared(batch: int) -> training.Step | None:
+    """The step with its batch shared out among the devices; None where there is one, or where it does not go evenly."""
+    count = jax.device_count()
+    return steps.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
 
 
 def _start(weights: lstm.Weights) -> training.TrainState:

@@ -6,7 +6,8 @@
   network (a round of the GAN: four steps of the critic, one of the generator). Ours is timed in one call of ten, as the
   loop has it, and alone as `single`. PyTorch starts from the same weights; first, three steps on the same draws must
   give the same metrics and weights. `memory_mb` is what our compiled program holds at once, `peer_memory_mb` what
-  PyTorch's allocator gave out at one moment of a step; data, weights and the optimiser's moments included.
+  PyTorch's allocator gave out at one moment of a step; data, weights and the optimiser's moments included. Operations
+  are those of the step's matrix products, gradients and the penalty's second ones among them, as JAX writes them down.
 * `gan_reference_step_b8`: the authors' GAN at an eighth of its width, in batches of 8 samples, since a step of 128
   takes sixteen times as long and more. --whole: at full width as well.
 * `gan_sample_64`, `flow_sample_64`: motions of one pair of labels.
@@ -118,7 +119,7 @@ def _step(
         "facejax": _work.onward(_work.scanned(given.step, SCAN), given.state, given.rows, given.held),
         "single": _work.onward(given.step, given.state, given.rows, given.held),
     }
-    theirs, about = {}, {"memory_mb": memory}
+    theirs, about = {}, {"memory_mb": memory, "gflop": _work.products(given.step, *given[1:])}
     if with_torch:
         from benchmarks import _motion_torch, _torch_memory
 

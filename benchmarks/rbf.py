@@ -9,7 +9,8 @@
   of that kind.
 
 What is compared gives the same displacements, which is checked first. SciPy's calls work in float64 throughout, ours in
-float64 up to the weights. Costs against size: vertices 1,000 to 100,000 and frames 10 to 1,000. About a minute.
+float64 up to the weights. Operations are those of two products, a vertex's weights (L + 4 by L) and its frames (L by
+3 T), bytes those of the frames. Costs against size: vertices 1,000 to 100,000 and frames 10 to 1,000. About a minute.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ def run(config: Config) -> _measure.Found:
     for side in list(once)[1:]:
         _equal.check(once["facejax"](), once[side](), tolerance=1e-5)
     _equal.check(refit(), each["SciPy, each frame"](), tolerance=1e-5)
-    name, options = f"{config.frames}x{config.vertices}", {"items": config.frames, "unit": "frames"}
+    count, frames = len(rest), config.frames
+    gflop = 2e-9 * config.vertices * ((count + 4) * count + count * 3 * frames)
+    work = {"gflop": gflop, "gbyte": 12e-9 * config.vertices * frames}
+    name, options = f"{frames}x{config.vertices}", {"items": frames, "unit": "frames", **work}
     repeats = 7 if config.quick else 25
     rows = [_measure.row(f"rbf_{name}", once, peers=["SciPy"], repeats=repeats, **options)]
     sides = {"facejax": once["facejax"], "refit": refit} | each

@@ -2,6 +2,8 @@
 
 import json
 import re
+import threading
+import time
 from pathlib import Path
 
 import jax
@@ -20,6 +22,7 @@ from benchmarks import (
     _timing,
     _torch,
     _transitions,
+    _work,
     augment,
     data,
     decoder,
@@ -73,6 +76,32 @@ def test_short_work_is_repeated_within_its_turn(monkeypatch):
     calls = []
     found = _timing.interleaved({"a": lambda: calls.append(0)}, repeats=1)
     assert len(calls) > 100 and found["a"]["median_s"] < 1e-3
+
+
+def test_a_turn_waits_for_the_threads_of_the_one_before(monkeypatch):
+    def spin(seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            pass
+
+    monkeypatch.setattr(_timing, "REST", 0.01)
+    thread = threading.Thread(target=spin, args=(0.2,))
+    thread.start()
+    _timing.settle()
+    assert not thread.is_alive()
+    monkeypatch.setattr(_timing, "PATIENCE", 0.05)
+    thread = threading.Thread(target=spin, args=(1.0,))
+    thread.start()
+    _timing.settle()
+    assert thread.is_alive()
+
+
+def test_operations_are_those_of_the_matrix_products():
+    a, b = jnp.ones((3, 5)), jnp.ones((5, 7))
+    slope = jax.grad(lambda a, b: jnp.sum(jnp.square(jax.jit(jnp.matmul)(a, b))), argnums=(0, 1))
+    repeated = lambda a, b: jax.lax.scan(lambda state, _: (state + a @ b, 0), jnp.zeros((3, 7)), length=4)  # noqa: E731
+    each = 2e-9 * 3 * 5 * 7
+    assert [_work.products(f, a, b) for f in (jnp.matmul, slope, repeated)] == pytest.approx([each, 3 * each, 4 * each])
 
 
 def test_a_row_names_the_fastest_peer(monkeypatch):

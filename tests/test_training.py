@@ -369,10 +369,34 @@ def test_models_side_by_side_resume_to_the_same_numbers(tmp_path):
     assert same(apart([0, 2], 12, tmp_path / "parts"), whole)
 
 
-def test_several_devices_share_the_models():
+def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
+    """A loss that is no mean over samples, and random numbers."""
+
+    def uneven(params, key, batch, _):
+        x, mask = batch
+        noise = jax.random.normal(key, x.shape)
+        return jnp.sum(mask * jnp.square((x + noise) @ params["w"])) / jnp.sum(mask), {"noise": jnp.mean(noise)}
+
+    rng = np.random.default_rng(0)
+    batch = jnp.asarray(rng.normal(size=(3, 8, 4)), jnp.float32), jnp.asarray(rng.random((3, 8, 1)) < 0.4, jnp.float32)
+    state = steps.start_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
+    step = steps.supervised(uneven, OPTIMISER)
+    shared = jax.jit(steps.data_parallel(step, axis=1))
+    one, several = state, state
+    for _ in range(3):
+        (one, expected), (several, found) = step(one, batch, ()), shared(several, batch, ())
+        for a, b in zip(jax.tree.leaves((one[1:3], expected)), jax.tree.leaves((several[1:3], found)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+            assert b.sharding.is_fully_replicated and len(b.devices()) == jax.device_count()
+    if jax.device_count() > 1:
+        with pytest.raises(ValueError, match="a batch of 7 cannot be shared out evenly among 2 devices"):
+            shared(state, jax.tree.map(lambda leaf: leaf[:, :7], batch), ())
+
+
+def test_several_devices_share_models_and_batches():
     """The tests above once more, where two networks have a device each, and three have one for all."""
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
-    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:xdist", __file__, "-k", "models_side_by_side"]
+    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:xdist", __file__, "-k", "side_by_side or shared_out"]
     found = subprocess.run(command, env=os.environ | {"XLA_FLAGS": flags}, cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout
-    assert "3 passed" in found.stdout
+    assert "4 passed" in found.stdout

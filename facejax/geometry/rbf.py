@@ -110,7 +110,7 @@ def weights(fit: Fit, vertices: np.ndarray) -> np.ndarray:
 
     In float64 on the host, once per face. Raises `ValueError` for vertices that are not finite, or traced.
     """
-    return _spread(fit, _points(vertices, "vertices"), np.float32)
+    return np.asarray(_spread(fit, _points(vertices, "vertices"), np.float32))
 
 
 @jax.jit
@@ -137,7 +137,8 @@ def apply(fit: Fit, displacements: jax.Array, vertices: np.ndarray) -> jax.Array
 
     `displacements` may be traced by jit, vmap or grad. `vertices` may not: under jit compute `weights` outside.
     """
-    return warp(weights(fit, vertices), displacements)
+    # The weights stay where they were made: taken to the host and back, they cost a sixth of the whole.
+    return warp(_spread(fit, _points(vertices, "vertices"), np.float32), displacements)
 
 
 def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **options) -> np.ndarray:
@@ -159,17 +160,17 @@ def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **o
             found = fit(rest + before, **options)
         except ValueError as error:
             raise ValueError(f"frame {t}: {error}") from error
-        moved = moved + _spread(found._replace(inverse=found.inverse @ (here - before)), moved, np.float64)
+        moved = moved + np.asarray(_spread(found._replace(inverse=found.inverse @ (here - before)), moved, np.float64))
         out[t], before = moved - start, here
     return out
 
 
-def _spread(fit: Fit, vertices: np.ndarray, dtype: type) -> np.ndarray:
-    """How far each landmark moves each vertex (N, 3): (N, L) of a dtype, computed in float64."""
+def _spread(fit: Fit, vertices: np.ndarray, dtype: type) -> jax.Array:
+    """How far each landmark moves each vertex (N, 3): (N, L) of a dtype on the host, computed in float64."""
     host = jax.devices("cpu")[0]
     # Also within a trace: everything here is known.
     with jax.ensure_compile_time_eval(), jax.enable_x64(True), jax.default_device(host):
-        return np.asarray(_spread_on(fit.kernel, dtype, fit[1:], vertices))
+        return _spread_on(fit.kernel, dtype, fit[1:], vertices)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -178,10 +179,12 @@ def _spread_on(kernel: str, dtype: type, fit: tuple, vertices: jax.Array) -> jax
     points = (vertices - origin) / unit
     # Not |v|^2 - 2 v.c + |c|^2 by a product, which cancels at the landmarks.
     squared = sum(jnp.square(points[:, None, axis] - centres[:, axis]) for axis in range(3))
-    basis = KERNELS[kernel].phi(jnp, squared)
-    if len(inverse) > len(centres):
-        basis = jnp.concatenate([basis, jnp.ones_like(points[:, :1]), points], axis=1)
-    return (basis @ inverse).astype(dtype)
+    count = len(centres)
+    found = KERNELS[kernel].phi(jnp, squared) @ inverse[:count]
+    if len(inverse) > count:
+        # Not by a wider product: to put columns beside the basis is a pass over memory, a sum on the way out is none.
+        found += inverse[count] + sum(points[:, None, axis] * inverse[count + 1 + axis] for axis in range(3))
+    return found.astype(dtype)
 
 
 def _gaussian(xp: ModuleType, squared: Any) -> Any:

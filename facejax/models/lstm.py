@@ -166,7 +166,8 @@ def _weight_slopes(x: jax.Array, hidden: jax.Array, d_gates: jax.Array) -> Weigh
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Sum over steps and sequences of outer products: (T, B, m) and (T, B, n) -> (m, n)."""
-    return a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1])
+    # Not of arrays reshaped to (T B, .): where sequences lie on several devices, those would first be gathered on each.
+    return jnp.tensordot(a, b, ((0, 1), (0, 1)))
 
 
 @jax.custom_vjp
