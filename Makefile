@@ -12,7 +12,7 @@ help:
 	@echo "make slow    the slow tests, by hand"
 	@echo "make browser the tests that need Chromium and Node, see README"
 	@echo "make lint    ruff"
-	@echo "make bench   the benchmarks with their peers, a quarter of an hour"
+	@echo "make bench   the benchmarks with their peers, a quarter of an hour; BENCH='--quick' and other options"
 	@echo "make clean   remove the virtual environment and the runs"
 
 setup: $(STAMP)
@@ -42,7 +42,7 @@ lint: setup
 
 bench: setup geomstats
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench,experiments]"
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks $(BENCH)
 
 # It needs an older NumPy than the rest, and so an environment of its own.
 geomstats: .venv-geomstats/.installed

@@ -20,23 +20,33 @@ def test_every_core_is_a_device():
     assert devices == cores
 
 
-def test_freed_memory_stays_with_the_process():
-    """Pages of a large array are faulted in at every turn, and only once where memory is kept."""
+@pytest.mark.parametrize("thread", [False, True])
+def test_freed_memory_stays_with_the_process(thread):
+    """Pages of a large array are faulted in at every turn, and only once where memory is kept; in threads too."""
     if not sys.platform.startswith("linux"):
         pytest.skip("glibc's allocator is not here")
     code = """
-import resource, numpy as np
+import resource, threading, numpy as np
 from facejax import runtime
 told = {keep} and runtime.keep_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-np.ones(10_000_000, np.float32)
-before = faults()
-for _ in range(5):
+
+def several():
     np.ones(10_000_000, np.float32)
-print(told, faults() - before)
+    before = faults()
+    for _ in range(5):
+        np.ones(10_000_000, np.float32)
+    print(told, faults() - before)
+
+if {thread}:
+    thread = threading.Thread(target=several)
+    thread.start()
+    thread.join()
+else:
+    several()
 """
-    told, kept = printed(code.format(keep=True))
-    _, given_back = printed(code.format(keep=False))
+    told, kept = printed(code.format(keep=True, thread=thread))
+    _, given_back = printed(code.format(keep=False, thread=thread))
     if told == "False":
         pytest.skip("another C library than glibc")
     assert int(kept) < 0.1 * int(given_back)
