@@ -22,7 +22,7 @@ WORKS = (
     Work("s2d_forward_b1", "S2D-Dec forward, one mesh", "5x; under 5 ms", ("torch",)),
     Work("s2d_train_step_b16", "S2D-Dec training step, batch 16", "3x", ("torch",)),
     Work("lstm_train_step_b5", "LSTM 3 x 128 training step, 5 sequences of 135 x 204", "1x", ("torch",)),
-    Work("lstm_train_step_b32", "the same, 32 sequences", "1x", ("torch",)),
+    Work("lstm_train_step_b32", "the same, 32 sequences, shared among the cores", "1x", ("torch",)),
     Work("lstm_train_step_x6_b5", "six networks, a step of 5 sequences each", "1.25x", ("torch",)),
     Work("gan_step_b128", "Motion3DGAN step, 4 of the critic and 1 of the generator, batch 128", "1.2x", ("torch",)),
     Work("flow_step_b256", "training step of the flow, batch 256", "", ("torch",)),
