@@ -167,7 +167,6 @@ def _geomstats(python: Path, curves: np.ndarray) -> Iterator[dict[str, dict[str,
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         # What `runtime.keep_memory` does for everybody in this process.
         environment |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 30), "MALLOC_TRIM_THRESHOLD_": str(runtime.KEPT)}
-        environment |= {"MALLOC_ARENA_MAX": "1"}
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         ) as child:

@@ -14,7 +14,7 @@ import jax
 from facejax.data import cache
 
 KEPT = (1 << 31) - 1  # bytes that stay with the process though nobody uses them
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # glibc's malloc.h
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 
 
 def start() -> None:
@@ -34,9 +34,9 @@ def keep_memory() -> bool:
 
     By default it gives large arrays back to the system when they are freed, and the next one's pages are faulted in and
     zeroed again, which can take longer than the arithmetic: 1,000 motions were encoded in 13 ms, and so in 3.4. At most
-    2 GB are kept, in one arena for all threads: what lies in a thread's own is given back all the same. For processes
-    on a CPU, where arrays of some 10 MB come and go; to be called before threads are started, so early. Elsewhere it
-    does nothing.
+    2 GB are kept; for processes on a CPU, where arrays of some 10 MB come and go. Elsewhere it does nothing. What
+    threads take for themselves is given back all the same: one arena for all of them would keep that too, but PyTorch
+    then took up to five times as long.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -44,7 +44,7 @@ def keep_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except AttributeError:  # another C library
         return False
-    return all([mallopt(_MMAP_THRESHOLD, 1 << 30), mallopt(_TRIM_THRESHOLD, KEPT), mallopt(_ARENA_MAX, 1)])
+    return bool(mallopt(_MMAP_THRESHOLD, 1 << 30) and mallopt(_TRIM_THRESHOLD, KEPT))
 
 
 def every_core() -> None:

@@ -20,33 +20,23 @@ def test_every_core_is_a_device():
     assert devices == cores
 
 
-@pytest.mark.parametrize("thread", [False, True])
-def test_freed_memory_stays_with_the_process(thread):
-    """Pages of a large array are faulted in at every turn, and only once where memory is kept; in threads too."""
+def test_freed_memory_stays_with_the_process():
+    """Pages of a large array are faulted in at every turn, and only once where memory is kept."""
     if not sys.platform.startswith("linux"):
         pytest.skip("glibc's allocator is not here")
     code = """
-import resource, threading, numpy as np
+import resource, numpy as np
 from facejax import runtime
 told = {keep} and runtime.keep_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-
-def several():
+np.ones(10_000_000, np.float32)
+before = faults()
+for _ in range(5):
     np.ones(10_000_000, np.float32)
-    before = faults()
-    for _ in range(5):
-        np.ones(10_000_000, np.float32)
-    print(told, faults() - before)
-
-if {thread}:
-    thread = threading.Thread(target=several)
-    thread.start()
-    thread.join()
-else:
-    several()
+print(told, faults() - before)
 """
-    told, kept = printed(code.format(keep=True, thread=thread))
-    _, given_back = printed(code.format(keep=False, thread=thread))
+    told, kept = printed(code.format(keep=True))
+    _, given_back = printed(code.format(keep=False))
     if told == "False":
         pytest.skip("another C library than glibc")
     assert int(kept) < 0.1 * int(given_back)
