@@ -4,12 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: help setup demo test slow lint browser bench geomstats clean
+.PHONY: help setup demo test slow faults lint browser bench geomstats clean
 
 help:
 	@echo "make demo    set up, then animate three unseen faces into runs/demo"
 	@echo "make test    set up, then run the tests"
 	@echo "make slow    the slow tests, by hand"
+	@echo "make faults  kills, full disks, lost processes and 20,000 damaged files per reader, an hour"
 	@echo "make browser the tests that need Chromium and Node, see README"
 	@echo "make lint    ruff"
 	@echo "make bench   the benchmarks with their peers, a quarter of an hour; BENCH='--quick' and other options"
@@ -32,6 +33,12 @@ test: setup
 
 slow: setup
 	$(BIN)/python -m pytest -n 2 -m slow
+
+faults: setup
+	@mkdir -p runs && rm -f runs/faults.jsonl
+	FACEJAX_FAULT_TRIES=50 FACEJAX_FAULT_FILES=20000 FACEJAX_FAULT_RECORD=$(CURDIR)/runs/faults.jsonl \
+	  $(BIN)/python -m pytest -n 2 -m "slow or not slow" tests/faults tests/geometry/test_singular.py
+	$(BIN)/python tests/faults/table.py runs/faults.jsonl
 
 browser: setup
 	$(BIN)/python -m pytest -m browser tests/io tests/test_user_study.py

@@ -5,13 +5,14 @@
 
 The first writes FOLDER/NAME.json, table.md and sizes.png; with --publish also benchmarks/results and the baseline,
 whose tolerances come of --runs runs. The second runs them anew, or takes the files, and ends with exit code 1
-where a ratio to a peer has fallen by more than its tolerance.
+where a ratio to a peer has fallen by more than its tolerance. Both want a quiet machine.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -77,6 +78,9 @@ def everything(config: Config) -> int:
     names = _chosen(config.only)
     if config.publish and (config.quick or config.only):
         raise ValueError("--publish writes what the README quotes: leave out --quick and --only")
+    if config.runs < 1 or (config.publish and config.runs < 2):
+        raise ValueError(f"--runs: expected 1 or more, with --publish 2 or more, got {config.runs}")
+    _writable(config.out)
     runs = [_run(names, config.out, config.quick or left > 0) for left in range(config.runs)[::-1]]
     documents = runs[-1]
     table, sizes = _written(documents, config.out)
@@ -89,6 +93,8 @@ def everything(config: Config) -> int:
 def compare(config: Compare) -> int:
     """1 where something got slower than its own ratio."""
     known = _compare.read(config.baseline)
+    if config.given and (config.only or config.quick):
+        raise ValueError("--only and --quick go with a run, not with files")
     if config.given:
         rows = _compare.rows_of(config.given)
     else:
@@ -98,6 +104,13 @@ def compare(config: Compare) -> int:
     if fallen:
         print(f"\nslower than {config.baseline.name} tolerates: {', '.join(fallen)}")
     return 1 if fallen else 0
+
+
+def _writable(folder: Path) -> None:
+    """Make it, or say before anything is measured that it cannot be written."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK):
+        raise ValueError(f"--out {folder}: not writable")
 
 
 def _chosen(only: tuple[str, ...]) -> tuple[str, ...]:

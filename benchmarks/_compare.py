@@ -1,12 +1,14 @@
 """What got slower than its own ratio to the peer, since the baseline that is committed.
 
 Absolute times say more of a machine than of the code. A ratio to a peer in the same run is the code's own; the baseline
-holds it with the part by which it may fall before that counts, which is what several runs of one commit differed by.
+holds it with the part by which it may fall before that counts: half as much again as what several runs of one commit
+differed by, and 15 to 50 %.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +36,8 @@ def read(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text())
         for row in found["rows"].values():
-            row["ratio"], row["tolerance"]
+            if not (_number(row["ratio"]) and row["ratio"] > 0 and _number(row["tolerance"])):
+                raise ValueError("ratio and tolerance must be numbers")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{path}: not a baseline of ratios ({error}); `python -m benchmarks --publish` writes one"
@@ -47,8 +50,16 @@ def rows_of(paths: Sequence[Path]) -> list[dict[str, Any]]:
     rows = []
     for path in paths:
         try:
-            rows += json.loads(path.read_text())["rows"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            found = json.loads(path.read_text())
+            # One benchmark's, or all of them as they are published.
+            mine = [row for part in found.get("benchmarks", [found]) for row in part["rows"]]
+            for row in mine:
+                if not (isinstance(row["name"], str) and (row["ratio"] is None or _number(row["ratio"]))):
+                    raise ValueError(f"a row without name or ratio: {str(row)[:60]}")
+            if not mine:
+                raise ValueError("holds no rows")
+            rows += mine
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not the figures of a benchmark ({error}); --json writes them") from error
     return rows
 
@@ -70,6 +81,10 @@ def table(rows: Sequence[Mapping[str, Any]], known: Mapping[str, Mapping[str, fl
         cells = f"{row['ratio']:.2f} | {before['ratio']:.2f} | {change:+.0%} | -{before['tolerance']:.0%}"
         lines.append(f"| `{row['name']}` | {cells} | {'faster' if change > before['tolerance'] else word} |")
     return "\n".join(lines)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def _fell(row: Mapping[str, Any], before: Mapping[str, float]) -> bool:

@@ -87,20 +87,35 @@ def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -
     """Parse the command line, measure, print the tables, write the file. Bad input: one line, exit code 2."""
     description = sys.modules[run.__module__].__doc__
     config = tyro.cli(config_type, prog=f"python -m benchmarks.{name}", description=description)
+    if config.json is not None and (problem := _unwritable(config.json)):
+        print(f"benchmarks.{name}: --json {config.json}: {problem}", file=sys.stderr)
+        raise SystemExit(2)
     runtime.keep_memory()  # for the peers in this process too
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     begun = time.perf_counter()
     try:
         rows, sizes = run(config)
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"benchmarks.{name}: {' '.join(str(error).split())}", file=sys.stderr)
-        raise SystemExit(2) from error
+    except (ValueError, RuntimeError, OSError, AssertionError, IndexError, ZeroDivisionError) as error:
+        said = f"ours and a peer's differ: {error}" if isinstance(error, AssertionError) else str(error)
+        print(f"benchmarks.{name}: {' '.join(said.split())}", file=sys.stderr)
+        raise SystemExit(2) from None
     print(table(rows))
     if sizes:
         print("\n" + _sizes.table(sizes))
     if config.json is not None:
         about = {"seconds": round(time.perf_counter() - begun, 1), "load": load}
         write(config.json, {"benchmark": name, **about, "rows": rows, "sizes": sizes, "machine": _machine.about()})
+
+
+def _unwritable(path: Path) -> str | None:
+    """Why a file cannot be written, asked before minutes are spent on it."""
+    if path.is_dir():
+        return "is a folder"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        return error.strerror
+    return None if os.access(path.parent, os.W_OK) else "its folder is not writable"
 
 
 def write(path: Path, document: Any) -> None:

@@ -28,7 +28,8 @@ def along(
 
 
 def exponent(rows: Sequence[Row]) -> float:
-    """Of the power of size that the upper half of the sizes follows, where constant costs no longer weigh."""
+    """Of the power of size that all but the smallest sizes follow, where constant costs no longer weigh."""
+    # Of five sizes the largest four, of four or three all but one or none.
     upper = sorted(rows, key=lambda row: row["size"])[len(rows) // 2 - 1 :]
     size, cost = (np.log([row[key] for row in upper]) for key in ("size", "median_s"))
     return float(np.polyfit(size, cost, 1)[0])

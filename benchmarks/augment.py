@@ -6,7 +6,7 @@
   decodes every point of the geodesics, and `NumPy`, our way there. Our way in NumPy is the peer; all must agree.
 * `transitions_300000_PACE`: many, streamed, in a process of its own whose peak of memory is shown, `before_mb` when the
   data were there and `memory_mb` in the end. --quick takes a fifteenth.
-* `select_300000`: choosing the 1,000 nearest transitions of every pair of labels, without going through all.
+* `select_306000`: choosing the 1,000 nearest transitions of every pair of labels, without going through all.
 
 Costs against size: transitions 128 to 8,192, and 10 to 300 frames. About a minute, --quick half.
 """

@@ -7,7 +7,7 @@ squared error; 204 numbers a frame: 68 landmarks.
 
 * `lstm_forward`, `lstm_gradient`, `lstm_train_step` of one network, from the same weights and data on both sides. Our
   step is timed in one call of ten, as the training loop has it, and alone as `single`; its batch shared out among the
-  cores by `facejax.steps.data_parallel` where that goes evenly, and then on one device as `one device`.
+  cores by `facejax.parallel.data_parallel` where that goes evenly, and then on one device as `one device`.
 * `lstm_train_step_x6`: six networks by `facejax.steps.side_by_side`, shared among the cores, also one after another and
   under `vmap`, beside six steps of PyTorch.
 * `lstm_follow`: the network that reads its own output, beside the automatic gradient of its scan.
@@ -30,7 +30,7 @@ import numpy as np
 import optax
 
 from benchmarks import _equal, _measure, _sizes, _torch, _work
-from facejax import losses, runtime, steps, training
+from facejax import losses, parallel, runtime, steps, training
 from facejax.models import lstm
 
 RATE = 1e-3
@@ -242,7 +242,7 @@ def _step() -> training.Step:
 def _shared(batch: int) -> training.Step | None:
     """The step with its batch shared out among the devices; None where there is one, or where it does not go evenly."""
     count = jax.device_count()
-    return steps.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
+    return parallel.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
 
 
 def _start(weights: lstm.Weights) -> training.TrainState:

@@ -5,10 +5,10 @@
 * `rbf_135x10000`: everything from a new face to its motion: the system, weights, all frames. SciPy's RBFInterpolator
   takes all 405 channels in one call. `weights and warp` leaves out the system, `warp` is what another motion of the
   same face costs.
-* `rbf_refit_135x10000`: the same beside Seo & Luo's (2021) way, a new system for every frame, by SciPy. `refit` is ours
-  of that kind.
+* `rbf_refit_135x10000`: the same beside Seo & Luo's (2021) way, a new system for every frame, by SciPy: another answer,
+  which depends on the path, see `rbf.refit`. `refit` is ours of that kind, and what SciPy's is checked against.
 
-What is compared gives the same displacements, which is checked first. SciPy's calls work in float64 throughout, ours in
+All else gives the same displacements, which is checked first. SciPy's calls work in float64 throughout, ours in
 float64 up to the weights. Operations are those of two products, a vertex's weights (L + 4 by L) and its frames (L by
 3 T), bytes those of the frames. Costs against size: vertices 1,000 to 100,000 and frames 10 to 1,000. About a minute.
 """

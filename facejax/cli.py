@@ -33,6 +33,13 @@ def main(arguments: list[str] | None = None) -> None:
 def _generate(command: Generate) -> None:
     from facejax import produce
 
+    if command.count is not None:
+        return _corpus(command)
+    for name in ("people", "meshes", "shard", "distributed"):
+        if getattr(command, name) != getattr(Generate, name):
+            raise ValueError(f"--{name} goes with --count")
+    if command.end is None:
+        raise ValueError("--end is missing: the expression to arrive at; `facejax labels` lists them")
     worn = None
     if command.landmarks is None:
         neutral, notes = produce.neutral_face(command.face, command.model)
@@ -49,6 +56,30 @@ def _generate(command: Generate) -> None:
         frames=command.frames, fps=command.fps, intensity=command.intensity, formats=command.formats,
     )  # fmt: skip
     _said((done, tuple(f"{command.face}: {note}" for note in notes)))
+
+
+def _corpus(command: Generate) -> None:
+    from facejax import corpus, produce
+
+    for name in ("samples", "fps", "formats", "landmarks"):
+        if getattr(command, name) != getattr(Generate, name):
+            raise ValueError(f"--{name} does not go with --count")
+    if command.frames == "natural":
+        raise ValueError("--frames natural does not go with --count: all motions of a corpus are of one length")
+    if command.end is None and (command.then or command.start != Generate.start):
+        raise ValueError("--end is missing: --start and --then name a motion, without them each one is drawn")
+    if command.people and command.face:
+        raise ValueError(f"--people {command.people} and --face {command.face}: name one of them")
+    labels = () if command.end is None else (command.start, command.end, *command.then)
+    request = corpus.Request(
+        command.count, labels, command.seed, command.frames, command.intensity, command.meshes, command.shard
+    )
+    _said(
+        produce.generate_corpus(
+            request, command.out, face=command.face, people=command.people, model=command.model,
+            distributed=command.distributed,
+        )
+    )  # fmt: skip
 
 
 def _animate(command: Animate) -> None:

@@ -13,12 +13,12 @@ Format = Literal["glb", "html", "webp", "gif", "mp4", "png", "npz", "ply", "obj"
 
 @dataclasses.dataclass(frozen=True)
 class Generate:
-    """Animate a neutral face through two or more expressions."""
+    """Animate a neutral face through two or more expressions; with --count write a corpus of many motions."""
 
-    end: str
-    """Expression to arrive at; `facejax labels` lists them."""
     out: Path
     """Folder for the results; made if it is missing."""
+    end: str | None = None
+    """Expression to arrive at; `facejax labels` lists them. A corpus may go without: each motion then has its own."""
     start: str = "neutral"
     """Expression to start from."""
     then: UseAppendAction[tuple[str, ...]] = ()
@@ -42,6 +42,16 @@ class Generate:
     """Scale of the motion, 0 to 2."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
     """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
+    count: int | None = None
+    """Write a corpus instead: so many motions, as NPZ files with an index. Stopped, it goes on when called again."""
+    people: int = 0
+    """With --count: draw each motion's face from so many MakeHuman people. Default: the one face."""
+    meshes: bool = False
+    """With --count: vertices as well as landmarks."""
+    shard: int | None = None
+    """With --count: motions in a file, by default as many as make 64 MB."""
+    distributed: bool = False
+    """With --count: share the work with the other processes of a job, see `facejax.runtime.join`."""
 
 
 @dataclasses.dataclass(frozen=True)

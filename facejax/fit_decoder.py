@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
 from facejax import journal, losses, steps, training
 from facejax.data.meshes import Meshes
@@ -42,8 +43,12 @@ def fit(
     *,
     plan: Plan = Plan(),
     seed: int = 0,
+    mesh: Mesh | None = None,
 ) -> decoder.Params:
-    """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole."""
+    """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole.
+
+    `mesh` as in `training.run`.
+    """
     data = meshes.data
     chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
     journal.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
@@ -70,6 +75,7 @@ def fit(
         steps=plan.steps,
         constants=(scale, jax.device_put(hierarchy), weights),
         chunk=50,
+        mesh=mesh,
     )
     return decoder.Params(scale, state.params)
 

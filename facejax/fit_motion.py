@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
 from facejax import journal, losses, motion_examples, steps, training
 from facejax.data import motions
@@ -59,11 +60,12 @@ def fit_gan(
     config: motion.Config = motion.Config(),
     seed: int = 0,
     average: bool = True,
+    mesh: Mesh | None = None,
 ) -> motion.Params:
     """Train the generator against its critic; returns its moving average, or with `average` off its last state.
 
     Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
-    and another plan in it is refused.
+    and another plan in it is refused. With a `mesh` each batch is shared out, see `training.run`.
     """
     config = sized(config, chart)
     _claim(folder, "gan", plan, config, seed, examples.values)
@@ -92,7 +94,7 @@ def fit_gan(
         decay=plan.decay,
     )
     state = steps.start_adversarial(players, optimisers, play_key)
-    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed, mesh)
     return motion.Params(chart, state.extra if average else state.params.generator)
 
 
@@ -104,8 +106,9 @@ def fit_flow(
     plan: FlowPlan = FlowPlan(),
     config: flow.Config = flow.Config(),
     seed: int = 0,
+    mesh: Mesh | None = None,
 ) -> flow.Params:
-    """Train a velocity field; returns its moving average. Chart, config and folder as in `fit_gan`.
+    """Train a velocity field; returns its moving average. Chart, config, folder and mesh as in `fit_gan`.
 
     Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
     exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
@@ -135,7 +138,7 @@ def fit_flow(
     optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
     step = steps.averaged(steps.supervised(loss, optimiser), plan.decay)
     state = steps.start_supervised(weights, optimiser, run_key)._replace(extra=weights)
-    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed, mesh)
     return flow.Params(chart, state.extra)
 
 
@@ -147,6 +150,7 @@ def fit_reference(
     plan: GanPlan = REFERENCE,
     config: motion_reference.Config = motion_reference.Config(),
     seed: int = 0,
+    mesh: Mesh | None = None,
 ) -> motion_reference.Params:
     """Train the GAN as its authors built it, on whole tangent vectors; returns the generator's moving average."""
     _, steps_, landmarks, _ = chart.basis.shape
@@ -198,11 +202,12 @@ def fit_reference(
         constants=((real, pair), chart),
         chunk=1,
         save_seconds=120.0,
+        mesh=mesh,
     )
     return motion_reference.Params(chart, state.extra)
 
 
-def _run(step, state, examples: motion_examples.Examples, chart, folder, count: int, batch: int, seed: int):
+def _run(step, state, examples: motion_examples.Examples, chart, folder, count: int, batch: int, seed: int, mesh):
     rows = motion_examples.balanced(examples.start, examples.end, seed)
     order = training.epoch_indices(seed, len(rows), batch)
     conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
@@ -214,6 +219,7 @@ def _run(step, state, examples: motion_examples.Examples, chart, folder, count: 
         folder,
         steps=count,
         constants=held,
+        mesh=mesh,
     )
 
 

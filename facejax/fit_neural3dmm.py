@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
 from facejax import fit_decoder, journal, losses, steps, training
 from facejax.data.meshes import Meshes
@@ -39,9 +40,15 @@ class Fitted(NamedTuple):
 
 
 def fit(
-    train: Meshes, hierarchy: Hierarchy, folder: str | os.PathLike, *, plan: Plan = Plan(), seed: int = 0
+    train: Meshes,
+    hierarchy: Hierarchy,
+    folder: str | os.PathLike,
+    *,
+    plan: Plan = Plan(),
+    seed: int = 0,
+    mesh: Mesh | None = None,
 ) -> Fitted:
-    """Train on meshes."""
+    """Train on meshes; `mesh` as in `training.run`."""
     data = train.data
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
     journal.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
@@ -83,6 +90,7 @@ def fit(
         steps=plan.steps,
         constants=(scale, hierarchy, down, weights, jnp.asarray(data.neutral)),
         chunk=50,
+        mesh=mesh,
     )
     return Fitted(neural3dmm.Params(scale, state.params), hierarchy, down)
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
 from facejax import expand, fit_gpmm, journal, steps, training, weights
 from facejax.data.meshes import Meshes
@@ -47,8 +48,12 @@ def fit(
     by: str = "subjects",
     seed: int = 0,
     base: fit_gpmm.Fitted | None = None,
+    mesh: Mesh | None = None,
 ) -> expand.Params:
-    """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit."""
+    """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit.
+
+    `mesh` as in `training.run`.
+    """
     folder, data = Path(folder), train.data
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
     base = base or fit_gpmm.fit(train, by=by)
@@ -96,6 +101,7 @@ def fit(
         steps=plan.steps,
         constants=(scale, hierarchy, tables, jnp.asarray(data.neutral)),
         chunk=25,
+        mesh=mesh,
     )
     network = residual.Params(scale, state.params, jnp.ones(()))
     fitted = expand.Params(base.params, network, hierarchy, tables)

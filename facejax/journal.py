@@ -70,6 +70,19 @@ class Journal:
             print(f"step {step}/{self._steps}  {note}", file=sys.stderr, flush=True)
 
 
+class Silent:
+    """A journal that keeps nothing, for processes that only help."""
+
+    def __enter__(self) -> "Silent":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def write(self, step: int, metrics: dict[str, float], *, seconds: float) -> None:
+        """Nothing."""
+
+
 def read(folder: str | os.PathLike) -> list[dict[str, float]]:
     """The entries of a run, oldest first; a last line cut short by a kill is left out."""
     entries = []

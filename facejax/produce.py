@@ -8,9 +8,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import animation, drive, files, io, pipeline, results, runtime, scanned
+from facejax import animation, corpus, drive, files, io, pipeline, results, runtime, scanned
 from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait, store
 from facejax.io import dress, faces
+
+MOST_PEOPLE = 1000  # of whom a corpus may be
 
 
 def generate(
@@ -60,6 +62,35 @@ def generate(
         written.append(results.save_landmarks(out / f"{name}-landmarks.npz", landmarks, labels, frames, fps))
         advance()
     return written
+
+
+def generate_corpus(
+    request: corpus.Request,
+    out: Path,
+    *,
+    face: Path | None = None,
+    people: int = 0,
+    model: Path | None = None,
+    distributed: bool = False,
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Write a corpus of motions of one face or of so many MakeHuman people; its index, and what was assumed."""
+    if distributed:
+        runtime.join()
+    runtime.start()
+    if not 0 <= people <= MOST_PEOPLE:
+        raise ValueError(f"--people must lie in 0..{MOST_PEOPLE}, got {people}")
+    models, notes = pipeline.load(model), ()
+    if people:
+        if not np.array_equal(models.face.faces, assets.load().faces):
+            raise ValueError(f"{model}: is in another topology than MakeHuman's people; leave --people out")
+        neutrals = {who.name: who.vertices for who in map(makehuman.subject, range(people))}
+    else:
+        vertices, notes = neutral_face(face, model)
+        neutrals = {"average" if face is None else face.stem: vertices}
+    results.writable(out)
+    with results.progress(out.name, None) as advance:
+        found = corpus.generate(models, request, neutrals, out, progress=advance)
+    return [found.path / "index.json"], tuple(f"{face}: {note}" for note in notes)
 
 
 def neutral_face(path: Path | None, model: Path | None = None) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -48,6 +48,26 @@ def keep_memory() -> bool:
 
 
 def every_core() -> None:
-    """Make every core of the processor a device of JAX: `steps.side_by_side` shares its models among them."""
+    """Make every core of the processor a device of JAX.
+
+    `steps.side_by_side` then shares its models among them, `parallel.data_parallel` its batch. Raises `RuntimeError`
+    where JAX has been used before.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     jax.config.update("jax_num_cpu_devices", cores or 1)
+
+
+def join(*, patience: int = 20) -> None:
+    """Join the other processes of a job, before anything else with JAX: `jax.devices()` are then everybody's.
+
+    By `jax.distributed.initialize`, with what JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and
+    JAX_PROCESS_ID (from 0) say; without them JAX finds the others where Slurm, Open MPI and some more have started
+    them. A process that is not heard of for `patience` seconds is lost, and ends the others. Raises `ValueError` where
+    some are set and others not, or are no numbers.
+    """
+    names = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+    told = [os.environ[name] for name in names if name in os.environ]
+    if len(told) not in (0, len(names)) or not all(number.isdigit() for number in told[1:]):
+        raise ValueError(f"expected all of {', '.join(names)}, the last two whole numbers, or none; got {told}")
+    job = [told[0], *map(int, told[1:])] if told else []
+    jax.distributed.initialize(*job, heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, PartitionSpec
 
 from facejax import losses
 from facejax.training import Metrics, Step, TrainState, Tree
@@ -67,6 +67,8 @@ def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
     anything else (six networks of three layers of 128 on two cores: 39 ms instead of 59). On one CPU device the models
     take turns: a batched small product runs through no fast kernel (72 ms under `vmap`). Elsewhere it is a `vmap`.
     """
+    if len(names) != len(ids) or len(set(names)) < len(names):
+        raise ValueError(f"names: expected one of its own for each of {len(ids)} models, got {list(names)}")
     ids = jnp.asarray(ids)
 
     def one(common, parts):
@@ -92,27 +94,6 @@ def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
         means = {name: jnp.mean(values) for name, values in metrics.items()}
         losses = {f"loss_{name}": metrics["loss"][i] for i, name in enumerate(names)} if len(names) > 1 else {}
         return TrainState(state.step + 1, params, opt_state, state.key, extra), means | losses
-
-    return stepped
-
-
-def data_parallel(step: Step, *, axis: int = 0, devices: Sequence[jax.Device] | None = None) -> Step:
-    """`step`, each batch shared out among devices along an axis of its leaves; by default among all that there are.
-
-    JAX's partitioner splits the work and sums the gradients: the step, its batch, its random numbers and so its
-    results, but for the order of sums, are those of one device. On a CPU it is worth it where products are too small
-    for several cores: `runtime.every_core()`. Raises `ValueError` for a batch that cannot be shared out evenly.
-    """
-    mesh = Mesh(np.array(jax.devices() if devices is None else devices), ("data",))
-    everywhere, split = (NamedSharding(mesh, PartitionSpec(*names)) for names in ((), (None,) * axis + ("data",)))
-    place = partial(jax.lax.with_sharding_constraint, shardings=everywhere)
-
-    def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
-        for leaf in jax.tree.leaves(batch):
-            if leaf.shape[axis] % mesh.size:
-                raise ValueError(f"a batch of {leaf.shape[axis]} cannot be shared out evenly among {mesh.size} devices")
-        batch = jax.lax.with_sharding_constraint(batch, split)
-        return place(step(place(state), batch, place(constants)))
 
     return stepped
 

@@ -22,9 +22,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from facejax import parallel
 from facejax.checkpoints import Checkpoints
-from facejax.journal import Journal
+from facejax.journal import Journal, Silent
 
 Tree = Any
 Metrics = dict[str, jax.Array]
@@ -87,6 +89,7 @@ def run(
     resume: bool = True,
     limit: float = 1e6,
     tensorboard: bool = False,
+    mesh: Mesh | None = None,
 ) -> TrainState:
     """Train until `steps` steps are done, counted from the very first start, and return the state.
 
@@ -95,55 +98,116 @@ def run(
     newest `keep`). With `resume`, goes on from the newest checkpoint, if there is one, and cuts
     `metrics.jsonl` back to it. SIGTERM and Ctrl-C save, then leave as usual (`SystemExit`,
     `KeyboardInterrupt`); a second one leaves at once. Raises `TrainingError` on a metric that is not finite
-    or beyond `limit`, with the step and its name.
+    or beyond `limit`, with the step and its name, and where a checkpoint cannot be written.
+
+    With a `mesh` (`parallel.line`) every batch is shared out along its first axis among the devices, which may be those
+    of several processes: each calls with the same arguments, the first one reads and writes `folder`, and the numbers
+    are those of one device but for the order of sums. A run may go on with another number of devices or processes. A
+    process that is lost stops the others within a minute.
     """
     folder = Path(folder)
+    if mesh is not None:
+        step = parallel.data_parallel(step, mesh=mesh)
 
-    @jax.jit(donate_argnums=0)
-    def advance(state: TrainState, data: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
+    def several(state: TrainState, data: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         if chunk == 1:  # no loop: within one, XLA runs convolutions on a CPU several times slower
             state, metrics = step(state, jax.tree.map(lambda x: x[0], data), constants)
             return state, jax.tree.map(lambda value: value[None], metrics)
         return jax.lax.scan(lambda state, batch: step(state, batch, constants), state, data)
 
-    with Checkpoints(folder / "checkpoints", keep=keep) as checkpoints, _stop_signals() as stopped:
-        if not resume and checkpoints.latest() is not None:
-            raise ValueError(f"{folder} holds a run of {checkpoints.latest()} steps: resume it, or name another folder")
+    # Whole on every device, so that any process can read what comes out.
+    laid_out = {} if mesh is None else {"out_shardings": parallel.everywhere(mesh)}
+    advance = jax.jit(several, donate_argnums=0, **laid_out)
+    with _Saved(folder / "checkpoints", keep) as saved, _stop_signals() as stopped:
+        if not resume and saved.latest is not None:
+            raise ValueError(f"{folder} holds a run of {saved.latest} steps: resume it, or name another folder")
         # Copied, since the first chunk would donate the caller's own arrays.
-        state = jax.tree.map(jnp.copy, state) if checkpoints.latest() is None else _unbound(checkpoints.restore(state))
-        done = saved = int(state.step)
-        saved_at = time.monotonic()
-        with Journal(folder, done, steps, tensorboard=tensorboard) as journal:
-            data = batches(done, min(chunk - done % chunk, steps - done)) if done < steps else None
-            while done < steps and not stopped:
+        state = saved.restored(jax.tree.map(jnp.copy, state))
+        done = int(state.step)
+        if mesh is not None:
+            whole, split = parallel.everywhere(mesh), parallel.along(mesh, 1)
+            state, constants = parallel.put(state, whole), parallel.put(constants, whole)
+
+        def prepared(first: int) -> Tree:
+            data = batches(first, min(chunk - first % chunk, steps - first))
+            return data if mesh is None else parallel.put(data, split)
+
+        saved_at, stopping = time.monotonic(), False
+        with Journal(folder, done, steps, tensorboard=tensorboard) if parallel.is_first() else Silent() as journal:
+            data = prepared(done) if done < steps else None
+            while done < steps and not stopping:
                 began = time.monotonic()
-                state, metrics = advance(state, data, constants)
-                first, done = done, done + jax.tree.leaves(data)[0].shape[0]
-                if done < steps:  # prepared while the device is busy
-                    data = batches(done, min(chunk, steps - done))
-                metrics = jax.device_get(metrics)
-                _check(metrics, first, limit, saved if checkpoints.latest() is not None else None, folder)
+                first, count = done, jax.tree.leaves(data)[0].shape[0]
+                with _company(first, saved, folder):
+                    state, metrics = advance(state, data, constants)
+                    done += count
+                    if done < steps:  # prepared while the device is busy
+                        data = prepared(done)
+                    metrics = jax.device_get(metrics)
+                    # A step that only some of them take would never end.
+                    stopping = bool(parallel.most(len(stopped)))
+                _check(metrics, first, limit, saved.latest, folder)
                 means = {name: float(np.mean(values, dtype=np.float64)) for name, values in metrics.items()}
-                journal.write(done, means, seconds=time.monotonic() - began)
-                due = save_steps is not None and done - saved >= save_steps
-                if due or time.monotonic() - saved_at >= save_seconds or done >= steps or stopped:
-                    checkpoints.save(done, state)
-                    saved, saved_at = done, time.monotonic()
-    if stopped:
-        raise KeyboardInterrupt if stopped[0] == signal.SIGINT else SystemExit(128 + stopped[0])
-    return _unbound(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
+                try:
+                    journal.write(done, means, seconds=time.monotonic() - began)
+                except OSError as error:
+                    why = f"{folder}: metrics.jsonl cannot be written ({error.strerror})"
+                    raise TrainingError(f"{why}; {_last(saved.on_disk())}") from error
+                due = save_steps is not None and done - (saved.latest or 0) >= save_steps
+                if due or time.monotonic() - saved_at >= save_seconds or done >= steps or stopping:
+                    saved.save(done, state)
+                    saved_at = time.monotonic()
+    if stopping and done < steps:
+        raise KeyboardInterrupt if stopped == [signal.SIGINT] else SystemExit(128 + (stopped or [signal.SIGTERM])[0])
+    return parallel.take(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
 
 
-def _unbound(state: TrainState) -> TrainState:
-    """Copies that belong to no device in particular, as new arrays do: a step may run on one or on several."""
+class _Saved:
+    """The checkpoints of a run that several processes may share: the first one reads and writes."""
 
-    def unbound(leaf: jax.Array) -> jax.Array:
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            data = jnp.asarray(np.asarray(jax.random.key_data(leaf)))
-            return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
-        return jnp.asarray(np.asarray(leaf))
+    def __init__(self, folder: Path, keep: int):
+        self._checkpoints = Checkpoints(folder, keep=keep) if parallel.is_first() else None
+        found = self._checkpoints.latest() if self._checkpoints else None
+        number = parallel.from_first(np.int32(-1 if found is None else found))
+        self.latest: int | None = None if number < 0 else int(number)
 
-    return jax.tree.map(unbound, state)
+    def __enter__(self) -> "_Saved":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._checkpoints:
+            self._checkpoints.close()
+
+    def on_disk(self) -> int | None:
+        """The newest checkpoint that is whole by now."""
+        return self._checkpoints.on_disk() if self._checkpoints else self.latest
+
+    def restored(self, state: TrainState) -> TrainState:
+        """The newest checkpoint in all processes, or the state that is given."""
+        if self.latest is None:
+            return state
+        if self._checkpoints:
+            state = parallel.take(self._checkpoints.restore(state, step=self.latest))
+        return parallel.from_first(state)
+
+    def save(self, step: int, state: TrainState) -> None:
+        if self._checkpoints:
+            self._checkpoints.save(step, parallel.take(state) if jax.process_count() > 1 else state)
+        self.latest = step
+
+
+@contextmanager
+def _company(step: int, saved: _Saved, folder: Path):
+    """Say what to do where another process is gone."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1:
+            raise
+        raise TrainingError(
+            f"another process was lost after step {step} ({str(error).splitlines()[0][:200]}); {_last(saved.latest)}, "
+            f"in {folder}: start again, with as many processes as there are"
+        ) from error
 
 
 def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int | None, folder: Path) -> None:
@@ -152,8 +216,11 @@ def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int 
     bad = [(int(np.argmax(where)), name) for name, where in wrong.items() if where.any()]
     if bad:
         at, name = min(bad)
-        last = f"the last good checkpoint is step {saved}" if saved is not None else "there is no checkpoint yet"
-        raise TrainingError(f"{name} became {metrics[name][at]} in step {first + at + 1}; {last}, in {folder}")
+        raise TrainingError(f"{name} became {metrics[name][at]} in step {first + at + 1}; {_last(saved)}, in {folder}")
+
+
+def _last(saved: int | None) -> str:
+    return f"the last good checkpoint is step {saved}" if saved is not None else "there is no checkpoint yet"
 
 
 @contextmanager
@@ -167,7 +234,7 @@ def _stop_signals():
 
     def receive(number: int, _: object) -> None:
         received.append(number)
-        signal.signal(number, before[number])
+        signal.signal(number, before[number] or signal.SIG_DFL)
 
     for number in before:
         signal.signal(number, receive)
@@ -175,4 +242,5 @@ def _stop_signals():
         yield received
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            # None: it was set by a library in C, and cannot be set again from here.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -20,6 +20,13 @@ from facejax import files
 
 Tree = Any
 _HEADER = "facejax"
+_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jax.numpy.bfloat16)}
+_DTYPES |= {
+    f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}")
+    for kind in "fiu"
+    for size in (1, 2, 4, 8)
+    if kind + str(size) != "f1"
+}
 
 
 class WeightsError(ValueError):
@@ -54,11 +61,12 @@ def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
     unexpected, or of another shape or dtype.
     """
     with _open(path) as file:
-        metadata = _metadata(path, file)
-        found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-    expected = names(like)
-    if wrong := mismatches(expected, found):
-        raise WeightsError(f"{path} does not fit the model that asks for it: {'; '.join(wrong)}")
+        metadata, expected = _metadata(path, file), names(like)
+        # Before any memory is taken for numbers.
+        stated = {name: _stated(file, name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        if wrong := mismatches(expected, stated):
+            raise WeightsError(f"{path} does not fit the model that asks for it: {'; '.join(wrong)}")
+        found = {name: file.get_tensor(name) for name in expected}
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected]), metadata
 
 
@@ -83,6 +91,12 @@ def mismatches(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
 
 def _describe(leaf: Any) -> str:
     return f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
+
+
+def _stated(file, name: str) -> Any:
+    """Shape and dtype of a tensor, as the header has them; a dtype that is unknown here is void."""
+    part = file.get_slice(name)
+    return jax.ShapeDtypeStruct(tuple(part.get_shape()), _DTYPES.get(part.get_dtype(), np.dtype("V1")))
 
 
 def _open(path: str | os.PathLike):

@@ -31,6 +31,7 @@ from benchmarks import (
     motion,
     pipeline,
     rbf,
+    scale,
     srvf,
 )
 from facejax import fit_motion, motion_examples, training
@@ -368,6 +369,26 @@ def test_rbf():
     rows, curves = checked(rbf.run(rbf.Config(vertices=50, frames=3, along_vertices=(50,), along_frames=(3,))))
     assert rows["rbf_3x50"]["peer"] == "SciPy" and rows["rbf_refit_3x50"]["peer"] == "SciPy, each frame"
     assert curves == {"rbf"}
+
+
+def test_scale():
+    sizes = {
+        "side": 20,
+        "meshes": 2,
+        "frames": 6,
+        "recordings": 2,
+        "motions": 4,
+        "sequences": (4, 600),
+        "million": 1000,
+    }
+    rows, curves = checked(scale.run(scale.Config(**sizes)))
+    assert set(rows) == {
+        "s2d_step_devices", "lstm_step_devices", "corpus_devices", "corpus_4", "corpus_600", "corpus_1000",
+    }  # fmt: skip
+    assert all(row["efficiency"] > 0 for row in rows.values() if "devices" in row)
+    assert rows["corpus_1000"]["simulated"] and curves == {"corpus"}
+    less, more = (rows[name]["median_s"] for name in ("corpus_4", "corpus_600"))
+    assert rows["corpus_1000"]["median_s"] == pytest.approx(more + 400 * (more - less) / 596)
 
 
 def test_linear():

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from facejax import cli, expressions, io
-from facejax.data import livelink, makehuman, store
+from facejax.data import corpora, livelink, makehuman, store
 from facejax.models import sequence
 
 
@@ -324,3 +324,28 @@ def test_bad_requests_to_animate_get_one_line(capsys, tmp_path, networks, odd_he
     text = marks.read_text().replace("[", "[[9, 9, 9], [", 1).replace("[[[", "[[")
     (tmp_path / "far.json").write_text(text)
     assert "far.json" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "far.json")
+
+
+def test_a_corpus_is_written_and_read(capsys, tmp_path):
+    out = tmp_path / "corpus"
+    code, printed, _ = run(capsys, "generate", "--count", 3, "--frames", 5, "--people", 2, "--out", out)
+    assert code == 0 and printed.split() == [str(out / "index.json")]
+    found = corpora.load(out)
+    assert len(found) == 3 and found.index["people"] == ["S000", "S001"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--count", 0), "count: expected 1 to"),
+        (("--count", 3, "--samples", 2), "--samples does not go with --count"),
+        (("--count", 3, "--frames", "natural"), "natural does not go with --count"),
+        (("--count", 3, "--start", "anger"), "--end is missing"),
+        (("--count", 3, "--people", 5000), "--people must lie in 0..1000"),
+        (("--count", 3, "--people", 2, "--face", "x.ply"), "name one of them"),
+        (("--end", "anger", "--people", 2), "--people goes with --count"),
+        ((), "--end is missing"),
+    ],
+)
+def test_a_corpus_that_cannot_be_is_refused(capsys, tmp_path, arguments, message):
+    assert message in refused(capsys, tmp_path / "o", "generate", *arguments)

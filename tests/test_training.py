@@ -16,7 +16,7 @@ import numpy as np
 import optax
 import pytest
 
-from facejax import journal, steps, training
+from facejax import journal, parallel, steps, training
 
 ROOT = Path(__file__).parents[1]
 DATA = np.random.default_rng(0).standard_normal((50, 4)).astype(np.float32)
@@ -381,7 +381,7 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
     batch = jnp.asarray(rng.normal(size=(3, 8, 4)), jnp.float32), jnp.asarray(rng.random((3, 8, 1)) < 0.4, jnp.float32)
     state = steps.start_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
     step = steps.supervised(uneven, OPTIMISER)
-    shared = jax.jit(steps.data_parallel(step, axis=1))
+    shared = jax.jit(parallel.data_parallel(step, axis=1))
     one, several = state, state
     for _ in range(3):
         (one, expected), (several, found) = step(one, batch, ()), shared(several, batch, ())

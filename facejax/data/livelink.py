@@ -49,7 +49,7 @@ NAMES = (
 )
 HEAD = ("headYaw", "headPitch", "headRoll")
 BASES = (24, 25, 30, 60)  # frames per second that a timecode may count in
-LIMIT = 2**28  # bytes of a file
+LIMIT = 2**28 - 2**26  # bytes of a file
 MOST = 1_000_000  # rows: more than four hours at 60 per second
 DAY, HALF_DAY = 86_400.0, 43_200.0
 LONG = 1.5  # usual spacings of rows: what is longer is a gap
@@ -87,13 +87,15 @@ def read(path: str | os.PathLike, *, base: int | None = None, trust_sides: bool 
         size = path.stat().st_size
         if not path.is_file() or not 0 < size <= LIMIT:
             raise RecordingError(f"{path}: {size} bytes; expected a file of 1 to {LIMIT}")
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = _lines(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not a text in UTF-8") from None
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
     try:
         return _parse(lines, base, trust_sides)
     except ValueError as error:
@@ -168,6 +170,12 @@ def unit_weights(recording: Recording) -> np.ndarray:
         if name in units:
             weights[:, units.index(name)] = recording.weights[:, column]
     return weights
+
+
+def _lines(text: str) -> list[str]:
+    if (count := text.count("\n") - 1) > MOST:  # without the names of the columns
+        raise ValueError(f"{count} rows; at most {MOST}")
+    return text.splitlines()
 
 
 def _parse(lines: list[str], base: int | None, trust_sides: bool) -> Recording:

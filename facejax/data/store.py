@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SCHEMA = 1
+INDEX_BYTES = 3 * 2**23  # of an index: thirty times as many when it is read
 SPLITS = ("train", "validation", "test")
 
 
@@ -89,8 +90,10 @@ def open_store(path: Path) -> Store:
     """Open a dataset for reading. Raises `StoreError`, naming the file."""
     path = Path(path)
     try:
+        if (path / "index.json").stat().st_size > INDEX_BYTES:
+            raise ValueError(f"more than {INDEX_BYTES} bytes")
         index = json.loads((path / "index.json").read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise StoreError(f"{path / 'index.json'} cannot be read ({error}): is this a prepared dataset?") from error
     if not isinstance(index, dict) or index.get("schema") != SCHEMA:
         found = index.get("schema") if isinstance(index, dict) else None
@@ -111,7 +114,40 @@ def open_store(path: Path) -> Store:
             raise KeyError("labels, rate, spec or subjects")
     except (KeyError, TypeError) as error:
         raise StoreError(f"{path / 'index.json'} lacks {error}: prepare the dataset anew") from error
+    if wrong := _wrong(index, sequences, arrays):
+        raise StoreError(f"{path / 'index.json'}: {wrong}: prepare the dataset anew")
     return Store(path, index, sequences, **arrays)
+
+
+def _wrong(index: dict[str, Any], sequences: tuple[Sequence, ...], arrays: dict[str, np.ndarray]) -> str | None:
+    """What in an index does not fit the arrays, or is of another kind than it should be."""
+    people, labels, rate = index["subjects"], index["labels"], index["rate"]
+    if not (isinstance(labels, list) and labels and all(isinstance(label, str) for label in labels)):
+        return "labels must be names"
+    if not (isinstance(people, list) and all(map(_is_person, people))):
+        return f"every subject must have a name and a split of {', '.join(SPLITS)}"
+    if not isinstance(index["spec"], dict):
+        return "spec must be an object"
+    if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0 < rate < np.inf:
+        return f"rate must be a number above 0, got {str(rate)[:40]}"
+    rows = 0
+    for number, one in enumerate(sequences):
+        marks = (one.subject, one.start, one.frames, one.onset, one.apex_start, one.apex_end, one.offset)
+        if not all(type(mark) is int for mark in marks) or not isinstance(one.label, str):
+            return f"sequence {number} counts in other than whole numbers"
+        if one.start != rows or one.frames < 1 or not 0 <= one.subject < len(people):
+            return f"sequence {number} begins at row {one.start}, expected {rows}, of subject {one.subject}"
+        rows += one.frames
+    if rows != len(arrays["landmarks"]) or len(people) != len(arrays["neutral"]):
+        return f"{rows} rows of {len(people)} subjects; there are {len(arrays['landmarks'])}, {len(arrays['neutral'])}"
+    drawn, at, faces = arrays["drawn"], arrays["landmark_index"], arrays["faces"]
+    for name, array, below in (("drawn", drawn, rows), ("landmark_index", at, None), ("faces", faces, None)):
+        below = arrays["neutral"].shape[1] if below is None else below
+        if array.dtype.kind not in "iu" or (array.size and not 0 <= array.min() <= array.max() < below):
+            return f"{name}.npy must hold whole numbers from 0 to {below - 1}"
+    if len(drawn) != len(arrays["vertices"]):
+        return f"{len(drawn)} rows are drawn, of {len(arrays['vertices'])} meshes"
+    return None
 
 
 def open_meshes(path: Path) -> Store:
@@ -120,3 +156,7 @@ def open_meshes(path: Path) -> Store:
     if len(found.vertices) == 0:
         raise StoreError(f"{path}: holds landmarks alone, expected meshes")
     return found
+
+
+def _is_person(who: Any) -> bool:
+    return isinstance(who, dict) and isinstance(who.get("name"), str) and who.get("split") in SPLITS

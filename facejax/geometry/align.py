@@ -64,14 +64,15 @@ def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -
     """
     _check_points(source, "source")
     _check_points(target, "target", source.shape[-2])
-    from_, source_centroid = centre(source)
-    to, target_centroid = centre(target)
+    (from_, source_centroid), (to, target_centroid) = centre(source), centre(target)
+    (from_, small), (to, large) = _unit(from_), _unit(to)
     covariance = jnp.einsum("...ki,...kj->...ij", to, from_)
     rotation = _rotation(covariance)
     spread = jnp.sum(from_**2, axis=(-2, -1)) + jnp.zeros(covariance.shape[:-2], covariance.dtype)
     overlap = jnp.sum(rotation * covariance, axis=(-2, -1))
     usable = spread > 0
-    scale = jnp.where(usable, overlap / jnp.where(usable, spread, 1), 1) if scaling else jnp.ones_like(spread)
+    grown = overlap / jnp.where(usable, spread, 1) * (large / small)
+    scale = jnp.where(usable, grown, 1) if scaling else jnp.ones_like(spread)
     turned = jnp.einsum("...ij,...j->...i", rotation, source_centroid)
     return Similarity(rotation, scale, target_centroid - scale[..., None] * turned)
 
@@ -102,11 +103,14 @@ def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
         return _read(curve, jnp.asarray(index), jnp.asarray(places - index, curve.dtype))
     if by != "arc":
         raise ValueError(f'by: expected "time" or "arc", got {by!r}')
-    steps = root(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1)))
+    flat = curve.reshape(*curve.shape[:-2], -1)
+    steps = root(jnp.sum(_unit(jnp.diff(flat, axis=-2))[0] ** 2, axis=-1))
     covered = jnp.concatenate([jnp.zeros_like(steps[..., :1]), jnp.cumsum(steps, axis=-1)], axis=-1)
     wanted = covered[..., -1:] * jnp.linspace(0, 1, frames, dtype=curve.dtype)
     # The last frame that is not beyond the place: the segment after it has a length, except at the very end.
     index = jnp.sum(covered[..., None, :] <= wanted[..., :, None], axis=-1) - 1
+    # The ends are kept, also where steps are too short to count.
+    index = index.at[..., 0].set(0).at[..., -1].set(curve.shape[-3] - 1)
     before = jnp.take_along_axis(covered, index, axis=-1)
     after = jnp.take_along_axis(covered, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-1)
     inside = after > before
@@ -131,6 +135,16 @@ def _read(curve: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
     there = jnp.take_along_axis(curve, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-3)
     # This form, unlike (1 - w) a + w b, gives a back where a = b: standing still survives rounding.
     return here + weight * (there - here)
+
+
+def _unit(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Arrays (..., K, D) divided by their largest entry (...), held constant: no square leaves the range of the dtype.
+
+    What does not depend on the size, or is proportional to it, has the same values and gradients.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(points), axis=(-2, -1)))
+    size = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
+    return points / size[..., None, None], size
 
 
 @jax.custom_jvp

@@ -213,7 +213,8 @@ def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
     d = q - _wide(sign) * p
     own, along = inner(p, p), inner(p, d)
     lean = along / jnp.where(own > 0, own, 1)
-    return sign, lean, jnp.maximum(inner(d, d) - lean * along, 0), cosine, own
+    squared = jnp.where(own > 0, jnp.maximum(inner(d, d) - lean * along, 0), 0)
+    return sign, lean, squared, cosine, own
 
 
 def _tangent(p: jax.Array, q: jax.Array, along: _Along) -> jax.Array:

@@ -91,8 +91,8 @@ def covered(q: jax.Array) -> jax.Array:
     speed = jnp.sum(q**2, axis=(-2, -1))
     total = jnp.sum(speed, axis=-1, keepdims=True)
     moving = total > 0
-    share = jnp.cumsum(speed[..., :-1], axis=-1) / jnp.where(moving, total, 1)
-    # The last is not left to rounding.
+    # Neither the last nor what comes before it is left to rounding.
+    share = jnp.minimum(jnp.cumsum(speed[..., :-1], axis=-1) / jnp.where(moving, total, 1), 1)
     return jnp.concatenate([jnp.zeros_like(total), share, jnp.where(moving, jnp.ones_like(total), 0)], axis=-1)
 
 

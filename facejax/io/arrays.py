@@ -5,13 +5,15 @@ Functions raise plain ValueError, and what `zipfile` raises on damage; `facejax.
 
 import math
 import tokenize
+import warnings
 import zipfile
 import zlib
 from pathlib import Path
 
 import numpy as np
 
-LIMIT = 2**28  # bytes of a file or of an array in it; a head takes a quarter of a megabyte
+LIMIT = 2**28  # bytes of a file, or of the arrays in it; a head takes a quarter of a megabyte
+_DIRECTORY = 2**20  # bytes of an archive's list of members, of which each takes ten times as many when it is read
 # What the readers, and the zip and array parsers below them, raise on damaged input.
 DAMAGE = (
     ValueError,
@@ -31,9 +33,12 @@ _HEADERS = {
 
 def read_npz(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The wanted arrays that an NPZ holds; the first must be there."""
-    with zipfile.ZipFile(path) as archive:
+    with _open(path) as archive:
         names = _names(archive, wanted[0])
         found = {}
+        whole = sum(archive.getinfo(f"{name}.npy").file_size for name in wanted if name in names)
+        if whole > LIMIT:
+            raise ValueError(f"its arrays take {whole} bytes, more than {LIMIT}")
         for name in wanted:
             if name in names:
                 with archive.open(f"{name}.npy") as stream:
@@ -43,7 +48,7 @@ def read_npz(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 def read_some(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Those of the named arrays that an NPZ holds."""
-    with zipfile.ZipFile(path) as archive:
+    with _open(path) as archive:
         there = {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
     found = tuple(name for name in names if name in there)
     return read_npz(path, found) if found else {}
@@ -51,7 +56,7 @@ def read_some(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 def shape_in_npz(path: Path, name: str) -> tuple[int, ...]:
     """The shape of an array that must be in an NPZ; its numbers are not read."""
-    with zipfile.ZipFile(path) as archive:
+    with _open(path) as archive:
         _names(archive, name)
         with archive.open(f"{name}.npy") as stream:
             return _header(stream, archive.getinfo(f"{name}.npy").file_size, name)[0]
@@ -80,6 +85,17 @@ def skip_object_header(stream) -> None:
         raise ValueError(f"expected one object, got {shape} {dtype}")
 
 
+def _open(path: Path) -> zipfile.ZipFile:
+    """An archive with a short list of members, which `zipfile` reads whole before anything else."""
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - 2**16 - 64))
+        tail = stream.read()
+    end = tail.rfind(b"PK\5\6")
+    if end >= 0 and (b"PK\6\7" in tail or int.from_bytes(tail[end + 12 : end + 16], "little") > _DIRECTORY):
+        raise ValueError("lists too many members for an NPZ of a few arrays")
+    return zipfile.ZipFile(path)
+
+
 def _names(archive: zipfile.ZipFile, needed: str) -> set[str]:
     names = {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
     if needed not in names:
@@ -100,7 +116,9 @@ def _header(stream, size: int, name: str, *, limit: int | None = LIMIT) -> tuple
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:
         raise ValueError(f"{name}: unknown array format {version}")
-    shape, fortran, dtype = _HEADERS[version](stream)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of how slow a header of Python 2 is
+        shape, fortran, dtype = _HEADERS[version](stream)
     if dtype.hasobject or dtype.kind not in "fiu":
         raise ValueError(f"{name}: must hold numbers, got {dtype}")
     need, there = math.prod(shape) * dtype.itemsize, size - stream.tell()

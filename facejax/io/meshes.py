@@ -5,6 +5,7 @@ file is a claim to be checked: counts are held against the bytes that are there 
 nothing is unpickled.
 """
 
+import array
 import os
 import re
 import shutil
@@ -18,6 +19,8 @@ from facejax import files
 from facejax.io import arrays, glb, ply
 from facejax.io.arrays import DAMAGE, LIMIT
 
+_TEXT_LIMIT = 2**26  # bytes of an OBJ
+_LINE_LIMIT = 2**20
 _FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
 
 
@@ -147,9 +150,10 @@ def write_sequence(folder: str | os.PathLike, vertices, faces, *, format="ply") 
 
 
 def _read_obj(path: Path):
-    vertices, faces = [], []
-    text = path.read_text("utf-8", errors="replace").replace("\\\n", " ")
-    for number, line in enumerate(text.splitlines(), 1):
+    if (size := path.stat().st_size) > _TEXT_LIMIT:
+        raise ValueError(f"{size} bytes of text; at most {_TEXT_LIMIT} are read: save it as binary PLY")
+    vertices, faces = array.array("d"), array.array("q")  # a list would take six times as much
+    for number, line in _lines(path):
         kind, *rest = line.split(maxsplit=1)[:2] or [""]
         if kind not in ("v", "f") or not rest:
             continue
@@ -157,7 +161,7 @@ def _read_obj(path: Path):
         try:
             if kind == "v":
                 x, y, z = fields[:3]
-                vertices.append((float(x), float(y), float(z)))
+                vertices.extend((float(x), float(y), float(z)))
                 continue
             corner = [int(field.split("/")[0]) for field in fields]
         except ValueError:
@@ -165,9 +169,28 @@ def _read_obj(path: Path):
         if len(corner) < 3 or 0 in corner:
             raise ValueError(f"line {number}: expected 3 or more corners from 1 on: {line[:60]!r}")
         # Negative numbers count back from the latest vertex.
-        corner = [i - 1 if i > 0 else len(vertices) + i for i in corner]
-        faces.extend((corner[0], corner[i], corner[i + 1]) for i in range(1, len(corner) - 1))
-    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
+        corner = [i - 1 if i > 0 else len(vertices) // 3 + i for i in corner]
+        if max(map(abs, corner)) > ply.MOST or len(vertices) + len(faces) > 3 * ply.MOST - 3 * len(corner):
+            raise ValueError(f"line {number}: a vertex beyond {ply.MOST}, or more triangles; that many are read")
+        for i in range(1, len(corner) - 1):
+            faces.extend((corner[0], corner[i], corner[i + 1]))
+    return np.frombuffer(vertices, np.float64).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
+
+
+def _lines(path: Path):
+    """Numbered lines, those that end in a backslash joined with the next."""
+    with path.open(encoding="utf-8", errors="replace") as stream:
+        begun = ""
+        for number, line in enumerate(iter(lambda: stream.readline(_LINE_LIMIT + 1), ""), 1):
+            if len(line) > _LINE_LIMIT or len(begun) > _LINE_LIMIT:
+                raise ValueError(f"line {number}: more than {_LINE_LIMIT} characters")
+            if line.endswith("\\\n"):
+                begun += line[:-2] + " "
+                continue
+            yield number, begun + line.rstrip("\n")
+            begun = ""
+        if begun:
+            yield number, begun
 
 
 def _read_npz(path: Path):
@@ -189,7 +212,8 @@ def _told(path: Path, reader, *options):
 
 
 def _checked(path: Path, vertices, faces) -> Mesh:
-    vertices = np.array(vertices, np.float64)
+    with np.errstate(invalid="ignore"):  # of numbers that are none: refused below
+        vertices = np.array(vertices, np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(f"{path}: vertices must be (N, 3), got {vertices.shape}")
     if not len(vertices):

@@ -3,6 +3,7 @@
 Functions raise plain ValueError; `meshes.read` adds the file's name.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,9 @@ _TYPES = {
 }  # fmt: skip
 _ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 16
+MOST = 1 << 23  # vertices, or triangles that the faces are cut into
+_TEXT_LIMIT = 1 << 26  # bytes of numbers as text, each of which takes up to four times as many as a number
+_RAGGED = 1 << 20  # rows of lists that differ in length: each becomes an array of its own
 
 
 class _Property(NamedTuple):
@@ -35,6 +39,11 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     order, elements, start = _header(data)
     # Text and binary differ only in where the next numbers come from.
     source = _Binary(data, start, order) if order else _Text(data, start)
+    with np.errstate(invalid="ignore"):  # of numbers that are none, or too large for an index: the caller refuses them
+        return _elements(source, elements)
+
+
+def _elements(source, elements: list[_Element]) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = None, np.zeros((0, 3), np.int64)
     for element in elements:
         columns = _rows(source, element)
@@ -93,6 +102,8 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
         # No number takes less than a byte, so that a false count is found before anything is made for it.
         if not 0 <= element.rows <= len(data):
             raise ValueError(f"header claims {element.rows} rows of {element.name} in {len(data)} bytes")
+        if element.name in ("vertex", "face") and element.rows > MOST:
+            raise ValueError(f"{element.rows} rows of {element.name}; at most {MOST} are read")
     return order, elements, line_end + 1
 
 
@@ -111,8 +122,13 @@ def _rows(source, element: _Element) -> dict:
     if columns is not None and all((columns[f"{name} length"] == k).all() for name, k in lengths.items()):
         source.at = attempt.at
         return columns
-    rows = [source.one_row(element) for _ in range(element.rows)]
-    return {item.name: [row[item.name] for row in rows] for item in element.properties}
+    if element.rows > _RAGGED:
+        raise ValueError(f"{element.rows} rows of {element.name} differ in length; at most {_RAGGED} may")
+    columns = {item.name: [] for item in element.properties}
+    for _ in range(element.rows):
+        for name, values in source.one_row(element).items():
+            columns[name].append(values)
+    return columns
 
 
 class _Binary:
@@ -156,8 +172,10 @@ class _Text:
     """A cursor in the numbers of a text."""
 
     def __init__(self, data: bytes, start: int):
+        if len(data) - start > _TEXT_LIMIT:
+            raise ValueError(f"{len(data)} bytes of text; at most {_TEXT_LIMIT} are read: save it as binary")
         try:
-            self.numbers = np.array(data[start:].split(), dtype=np.float64)
+            self.numbers = np.concatenate([np.array(words, np.float64) for words in _words(data, start)])
         except ValueError as error:
             raise ValueError(f"holds a word that is no number: {str(error)[-60:]}") from None
         self.at = 0
@@ -198,9 +216,21 @@ class _Text:
         return columns
 
 
+def _words(data: bytes, start: int, size: int = 1 << 20) -> Iterator[list[bytes]]:
+    """Words of a text, a megabyte at a time: as Python's they take many times their size."""
+    rest = b""
+    for at in range(start, len(data), size):
+        *whole, rest = (rest + data[at : at + size] + b"|").split()  # the mark ends the word that may go on
+        rest = rest[:-1]
+        yield whole
+    yield [rest] if rest else []
+
+
 def _fans(polygons) -> np.ndarray:
     """Triangles (F, 3) int64 of polygons: an array (P, k), or a list of arrays."""
     groups = [polygons] if isinstance(polygons, np.ndarray) else [polygon[None] for polygon in polygons]
+    if (count := sum(len(group) * (group.shape[1] - 2) for group in groups)) > MOST:
+        raise ValueError(f"its faces make {count} triangles; at most {MOST} are read")
     triangles = [np.zeros((0, 3), np.int64)]
     for group in groups:
         corners = group.shape[1]

@@ -1,0 +1,115 @@
+"""Several devices in one process, several processes: a line of devices that share out a batch.
+
+JAX's own partitioner and `jax.distributed` do the work; here is what a training loop and a writer of many files need
+around them. What every process holds is the same on all of them (the state, the data), batches are split along one
+axis. All of it goes for one process with one device too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+Tree = Any
+AXIS = "data"
+
+
+def line(devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """A mesh of one axis, `data`; by default all devices of all processes."""
+    return Mesh(np.array(jax.devices() if devices is None else devices), (AXIS,))
+
+
+def everywhere(mesh: Mesh) -> NamedSharding:
+    """The sharding of what every device holds whole."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def along(mesh: Mesh, axis: int = 0) -> NamedSharding:
+    """The sharding of arrays that are split along an axis."""
+    return NamedSharding(mesh, PartitionSpec(*(None,) * axis, AXIS))
+
+
+def put(tree: Tree, sharding: NamedSharding) -> Tree:
+    """Arrays, which every process has whole, laid out over the devices of all processes; typed random keys too."""
+
+    def one(leaf: Any) -> jax.Array:
+        if _is_key(leaf):
+            return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
+        held = np.asarray(leaf)
+        return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
+
+    return jax.tree.map(one, tree)
+
+
+def take(tree: Tree) -> Tree:
+    """Copies of arrays that every device holds whole, which belong to no device in particular, as new arrays do."""
+
+    def one(leaf: jax.Array) -> jax.Array:
+        if _is_key(leaf):
+            return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
+        return jax.numpy.asarray(np.array(leaf.addressable_data(0) if isinstance(leaf, jax.Array) else leaf))
+
+    return jax.tree.map(one, tree)
+
+
+def data_parallel(step: Callable, *, axis: int = 0, mesh: Mesh | None = None) -> Callable:
+    """`step`, each batch shared out among devices along an axis of its leaves; by default among all that there are.
+
+    JAX's partitioner splits the work and sums the gradients: the step, its batch, its random numbers and so its
+    results, but for the order of sums, are those of one device. On a CPU it is worth it where products are too small
+    for several cores: `runtime.every_core()`. Raises `ValueError` for a batch that cannot be shared out evenly.
+    """
+    mesh = line() if mesh is None else mesh
+    place = partial(jax.lax.with_sharding_constraint, shardings=everywhere(mesh))
+
+    def stepped(state: Tree, batch: Tree, constants: Tree) -> Tree:
+        for leaf in jax.tree.leaves(batch):
+            if not -leaf.ndim <= axis < leaf.ndim or not leaf.shape[axis] or leaf.shape[axis] % mesh.size:
+                what = f"{leaf.shape[axis]}" if -leaf.ndim <= axis < leaf.ndim else f"shape {leaf.shape}"
+                raise ValueError(f"a batch of {what} cannot be shared out evenly among {mesh.size} devices")
+        batch = jax.lax.with_sharding_constraint(batch, along(mesh, axis))
+        return place(step(place(state), batch, place(constants)))
+
+    return stepped
+
+
+def is_first() -> bool:
+    """Whether this process is the one that writes what all of them have."""
+    return jax.process_index() == 0
+
+
+def from_first(tree: Tree) -> Tree:
+    """What the first process has, in all of them; trees of one structure, with typed random keys or without."""
+    if jax.process_count() == 1:
+        return tree
+    bare = jax.tree.map(lambda leaf: np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf), tree)
+    told = multihost_utils.broadcast_one_to_all(bare)
+
+    def like(leaf: Any, found: Any) -> Any:
+        found = jax.numpy.asarray(np.asarray(found))
+        return jax.random.wrap_key_data(found, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else found
+
+    return jax.tree.map(like, tree, told)
+
+
+def most(number: int) -> int:
+    """The largest of what the processes say."""
+    if jax.process_count() == 1:
+        return number
+    return int(np.max(multihost_utils.process_allgather(np.int32(number))))
+
+
+def meet(name: str) -> None:
+    """Wait until all processes are here."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(name)
+
+
+def _is_key(leaf: Any) -> bool:
+    return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)

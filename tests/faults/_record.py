@@ -1,0 +1,21 @@
+"""How often each fault was tried, and what came of it; the README quotes the table.
+
+FACEJAX_FAULT_TRIES and FACEJAX_FAULT_FILES are set by `make faults`; without them few are tried. Outcomes are added to
+the file that FACEJAX_FAULT_RECORD names.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+
+TRIES = int(os.environ.get("FACEJAX_FAULT_TRIES", 0))
+FILES = int(os.environ.get("FACEJAX_FAULT_FILES", 0))
+
+
+def outcome(fault: str, where: str, tries: int, came_of_it: str) -> None:
+    """Add a line."""
+    if path := os.environ.get("FACEJAX_FAULT_RECORD"):
+        line = json.dumps({"fault": fault, "where": where, "tries": tries, "outcome": came_of_it})
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(line + "\n")

@@ -1,0 +1,159 @@
+"""Every training loop, on tiny data: `python tests/faults/loops.py LOOP FOLDER`.
+
+Prints `begun` when the first step is about to be taken, and the SHA-256 of the result when it is done. Checkpoints are
+frequent, and steps slow enough to be killed between any two.
+"""
+
+import argparse
+import hashlib
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+STEPS, EVERY = 24, 4
+
+
+def motions():
+    from facejax import motion_examples
+    from tests.data.test_motions import recorded
+
+    known = motion_examples.transitions(recorded(subjects=6), "train", per_pair=6)
+    chart = motion_examples.chart_of(known, labels=4, rank=8, pose=4)
+    return known, chart, motion_examples.examples_of(chart, [known])
+
+
+def gan(folder, mesh):
+    from facejax import fit_motion
+    from facejax.models import motion
+
+    _, chart, examples = motions()
+    plan = fit_motion.GanPlan(steps=STEPS, batch=4, critic_steps=2)
+    config = motion.Config(width=16, blocks=1, noise=4, embedding=4)
+    return fit_motion.fit_gan(examples, chart, folder, plan=plan, config=config, mesh=mesh)
+
+
+def flow(folder, mesh):
+    from facejax import fit_motion
+    from facejax.models import flow
+
+    _, chart, examples = motions()
+    plan = fit_motion.FlowPlan(steps=STEPS, batch=8)
+    return fit_motion.fit_flow(
+        examples, chart, folder, plan=plan, config=flow.Config(width=16, blocks=1, embedding=4), mesh=mesh
+    )
+
+
+def reference(folder, mesh):
+    from facejax import fit_motion
+    from facejax.models import motion_reference
+
+    known, chart, _ = motions()
+    plan = fit_motion.REFERENCE._replace(steps=STEPS, batch=2, critic_steps=2)
+    config = motion_reference.Config(width_divisor=16, noise=4)
+    return fit_motion.fit_reference(known, chart, folder, plan=plan, config=config, mesh=mesh)
+
+
+def balls():
+    from facejax.data import meshes
+    from facejax.mesh import topology
+    from tests.balls import store_of_balls
+
+    data = store_of_balls()
+    template = data.neutral.mean(axis=0, dtype=np.float64)
+    hierarchy = topology.build(template, data.faces, factors=(2, 2, 2, 2), lengths=3)
+    return data, meshes.of_split(data, "train", size=20), hierarchy
+
+
+def decoder(folder, mesh):
+    from facejax import fit_decoder
+
+    _, train, hierarchy = balls()
+    return fit_decoder.fit(train, hierarchy, folder, plan=fit_decoder.Plan(steps=STEPS, batch=8), mesh=mesh)
+
+
+def residual(folder, mesh):
+    from facejax import fit_gpmm, fit_residual
+
+    _, train, hierarchy = balls()
+    base, plan = fit_gpmm.fit(train, components=20), fit_residual.Plan(steps=STEPS, batch=8)
+    return fit_residual.fit(train, hierarchy, folder, plan=plan, base=base, mesh=mesh).network
+
+
+def neural3dmm(folder, mesh):
+    from facejax import fit_neural3dmm
+
+    _, train, hierarchy = balls()
+    plan = fit_neural3dmm.Plan(steps=STEPS, batch=8)
+    return fit_neural3dmm.fit(train, hierarchy, folder, plan=plan, mesh=mesh).params
+
+
+def expressions(folder, mesh):
+    from facejax import fit_expressions
+    from facejax.data import sequences
+    from facejax.models import sequence
+
+    data, _, _ = balls()
+    labels = {name: data.labels.index(name) for name in ("a", "b")}
+    plan, config = fit_expressions.ExpressionPlan(steps=STEPS, batch=2), sequence.Config(hidden=8, layers=2)
+    known = sequences.read(data, "train", tuple(labels))
+    return fit_expressions.fit(known, folder, labels=labels, plan=plan, config=config)
+
+
+LOOPS = {loop.__name__: loop for loop in (gan, flow, reference, decoder, residual, neural3dmm, expressions)}
+
+
+def plainly(rate: float):
+    """Optimisers as one step down the gradient: what the parameters have changed by is the gradient."""
+    import optax
+
+    for name in ("adam", "adamw"):
+        setattr(optax, name, lambda *args, **options: optax.sgd(rate))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("loop", choices=LOOPS)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--pause", type=float, default=0.0, help="seconds before every chunk")
+    parser.add_argument("--devices", type=int, default=1, help="of this process")
+    parser.add_argument("--distributed", action="store_true", help="one of several processes")
+    parser.add_argument("--plain", type=float, help="one step down the gradient, at this rate")
+    parser.add_argument("--save", type=Path, help="an NPZ for the parameters")
+    given = parser.parse_args()
+    from facejax import parallel, runtime, training
+
+    jax.config.update("jax_num_cpu_devices", given.devices)
+    if given.distributed:
+        runtime.join(patience=10)
+    runtime.compile_cache()
+    several = given.distributed or given.devices > 1
+    if given.plain:
+        plainly(given.plain)
+    run = training.run
+
+    def frequent(step, state, batches, folder, **options):
+        def slow(first, count):
+            if first == 0 or given.pause:
+                print("begun", flush=True)
+            time.sleep(given.pause)
+            return batches(first, count)
+
+        often = {"chunk": EVERY // 2, "save_steps": EVERY} | ({"steps": 1} if given.plain else {})
+        return run(step, state, slow, folder, **options | often)
+
+    training.run = frequent
+    leaves = jax.tree.leaves(LOOPS[given.loop](given.folder, parallel.line() if several else None))
+    found = hashlib.sha256()
+    for leaf in leaves:
+        found.update(np.ascontiguousarray(leaf).tobytes())
+    if given.save:
+        np.savez(given.save, *leaves)
+    print(found.hexdigest(), flush=True)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+    main()
