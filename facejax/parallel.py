@@ -48,12 +48,14 @@ def put(tree: Tree, sharding: NamedSharding) -> Tree:
 
 
 def take(tree: Tree) -> Tree:
-    """Copies of arrays that every device holds whole, which belong to no device in particular, as new arrays do."""
+    """Copies of whole arrays that belong to no device in particular, as new arrays do."""
 
     def one(leaf: jax.Array) -> jax.Array:
         if _is_key(leaf):
             return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
-        return jax.numpy.asarray(np.array(leaf.addressable_data(0) if isinstance(leaf, jax.Array) else leaf))
+        # An array that lies with other processes too is whole on every device; one of this process may be in parts.
+        apart = isinstance(leaf, jax.Array) and not leaf.is_fully_addressable
+        return jax.numpy.asarray(np.array(leaf.addressable_data(0) if apart else leaf))
 
     return jax.tree.map(one, tree)
 

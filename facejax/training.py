@@ -157,7 +157,7 @@ def run(
                 if due or time.monotonic() - saved_at >= save_seconds or done >= steps or stopping:
                     saved.save(done, state)
                     saved_at = time.monotonic()
-    if stopping and done < steps:
+    if stopping or stopped:
         raise KeyboardInterrupt if stopped == [signal.SIGINT] else SystemExit(128 + (stopped or [signal.SIGTERM])[0])
     return parallel.take(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
 

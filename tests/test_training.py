@@ -365,6 +365,7 @@ def test_models_side_by_side_come_out_as_alone(tmp_path, monkeypatch, backend):
 
 def test_models_side_by_side_resume_to_the_same_numbers(tmp_path):
     whole = apart([0, 2], 12, tmp_path / "whole")
+    assert whole.params["w"].shape == (2, 4, 2)  # all of them, also where each has a device
     apart([0, 2], 8, tmp_path / "parts")
     assert same(apart([0, 2], 12, tmp_path / "parts"), whole)
 
