@@ -171,9 +171,11 @@ def landmark_weights(
     if mode == "none":
         return jnp.ones_like(vertices[:, 0])
     offsets = vertices[:, None] - vertices[landmark_indices]
-    distance = jnp.sqrt(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
+    distance = root(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
     if mode == "linear":
-        return jnp.maximum(1.0 - distance / jnp.max(distance), 0.0)  # the farthest vertex may round below 0
+        farthest = jnp.max(distance)
+        # The farthest vertex may round below 0. Where all are landmarks, nothing falls.
+        return jnp.maximum(1.0 - distance / jnp.where(farthest > 0, farthest, 1.0), 0.0)
     if edge_length is None:
         raise ValueError("mode 'inverse' needs edge_length, the mean edge length of the mesh")
     return edge_length / jnp.maximum(distance, edge_length)

@@ -47,7 +47,7 @@ def vertex_error(predicted: jax.Array, target: jax.Array, mask: jax.Array | None
     share = weights / jnp.sum(weights)
     # Vertices first, frames after: one float32 sum over 10^8 numbers would lose digits.
     mean = jnp.mean(distance @ share)
-    std = jnp.sqrt(jnp.mean((distance - mean) ** 2 @ share))
+    std = sphere.root(jnp.mean((distance - mean) ** 2 @ share))
     return Error(mean, std, jnp.sum(weights) * (distance.size // distance.shape[-1]))
 
 

@@ -1,9 +1,18 @@
 """Fixtures that several rooms share. Tiny sizes; one small dataset for the whole session."""
 
+import jax
+import numpy as np
 import pytest
 
 from facejax.data import makehuman, makehuman4d
 from tests import balls
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    """Either precision, as JAX is told to have it."""
+    with jax.enable_x64(request.param == "float64"):
+        yield np.dtype(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from facejax.mesh import areas
 from facejax.mesh.stencils import Stencil
 
 # With few output channels the products over all positions come out of one matrix product, and the batch
@@ -94,16 +95,17 @@ def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> ja
 def vertex_normals(vertices: jax.Array, faces: jax.Array) -> jax.Array:
     """Unit normals (..., N, 3) of vertices (..., N, 3): the mean of the adjacent triangles' (F, 3), by area.
 
-    Zero where the adjacent triangles have no area.
+    Zero where the adjacent triangles have no area, or cancel.
     """
     a, b, c = (vertices[..., faces[:, corner], :] for corner in range(3))
-    doubled = jnp.cross(b - a, c - a)  # twice the area long
-    total = jnp.zeros_like(vertices)
+    normal, double = areas.normals(b - a, c - a)
+    parts = jnp.concatenate([double * normal, double], axis=-1)
+    total = jnp.zeros((*vertices.shape[:-1], 4), vertices.dtype)
     for corner in range(3):
-        total = total.at[..., faces[:, corner], :].add(doubled)
-    square = jnp.sum(jnp.square(total), axis=-1, keepdims=True)
-    flat = square < 1e-30
-    return jnp.where(flat, 0.0, total / jnp.sqrt(jnp.where(flat, 1.0, square)))
+        total = total.at[..., faces[:, corner], :].add(parts)
+    mean, area = total[..., :3], total[..., 3:]
+    # What rounding leaves of areas that cancel is no direction.
+    return areas.direction(mean, areas.length(mean), jnp.finfo(mean.dtype).eps * area)
 
 
 def _joined(stencil: Stencil) -> Stencil:

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from facejax.mesh import areas
+
 
 class Around(NamedTuple):
     """The triangles, and which of them meet at each vertex."""
@@ -37,18 +39,18 @@ def around(faces: np.ndarray, count: int) -> Around:
 def strain(displacements: jax.Array, neutral: jax.Array, tables: Around) -> tuple[jax.Array, jax.Array]:
     """Strain (N, B, 6) and the neutral face's unit normals (N, B, 3), of (N, B, 3) and (N, B, 3).
 
-    Strain has no unit: 0.1 is a tenth longer; xx, yy, zz, xy, xz, yz in the axes of the mesh.
+    Strain has no unit: 0.1 is a tenth longer; xx, yy, zz, xy, xz, yz in the axes of the mesh. Both are 0 where the
+    triangles about a vertex have no area.
     """
     if displacements.shape != neutral.shape or neutral.shape[-1] != 3:
         raise ValueError(f"expected two arrays (N, B, 3), got {displacements.shape} and {neutral.shape}")
     a, b, c = (neutral[tables.faces[:, corner]] for corner in range(3))
     moved = [displacements[tables.faces[:, corner]] for corner in range(3)]
     first, second = b - a, c - a
-    normal = jnp.cross(first, second)
-    double = jnp.maximum(jnp.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    normal = normal / double
+    normal, double = areas.normals(first, second)
     # The dual basis of the two edges: G = du1 (x) dual1 + du2 (x) dual2.
-    duals = jnp.cross(second, normal) / double, jnp.cross(normal, first) / double
+    over = jnp.where(double > 0, 1 / jnp.where(double > 0, double, 1), 0)
+    duals = jnp.cross(second, normal) * over, jnp.cross(normal, first) * over
     slope = sum(
         (corner - moved[0])[..., :, None] * dual[..., None, :] for corner, dual in zip(moved[1:], duals, strict=True)
     )
@@ -59,5 +61,6 @@ def strain(displacements: jax.Array, neutral: jax.Array, tables: Around) -> tupl
     on_faces = jnp.concatenate([jnp.stack(six, axis=-1), normal], axis=-1)
     padded = jnp.concatenate([on_faces, jnp.zeros_like(on_faces[:1])])
     mean = padded[tables.about].sum(axis=1) / tables.count[:, None, None]
-    length = jnp.linalg.norm(mean[..., 6:], axis=-1, keepdims=True)
-    return mean[..., :6], mean[..., 6:] / jnp.maximum(length, 1e-12)
+    # What is left of a fold's normals that cancel is no direction.
+    lean = mean[..., 6:]
+    return mean[..., :6], areas.direction(lean, areas.length(lean), jnp.finfo(lean.dtype).eps)

@@ -19,10 +19,15 @@ STILL = 0.05  # mm, root mean square: a vertex that moves much more is held much
 
 
 def gradient(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """The operator from vertex values (N,) to constant gradients per triangle (3F,), and the areas (F,)."""
+    """The operator from vertex values (N,) to constant gradients per triangle (3F,), and the areas (F,).
+
+    Raises `ValueError` for a triangle without area, on which nothing has a gradient.
+    """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     double = np.linalg.norm(normal, axis=1, keepdims=True)
+    if not (double > 0).all():
+        raise ValueError(f"triangle {np.argmin(double)} has no area: leave it out, or move one of its corners")
     unit = normal / double
     # The gradient of a corner's hat function is the opposite edge turned by a right angle, over twice the area.
     corners = [np.cross(unit, edge) / double for edge in (c - b, a - c, b - a)]
@@ -40,7 +45,7 @@ class Carrier:
     def __init__(self, source: np.ndarray, target: np.ndarray, faces: np.ndarray, motion: np.ndarray):
         """`source` and `target` (N, 3), `motion` (N,): how far vertices usually move, root mean square in mm.
 
-        Raises `ValueError` for faces of different shapes.
+        Raises `ValueError` for faces of different shapes, and for a triangle without area.
         """
         source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
         if source.shape != target.shape or np.shape(motion) != source.shape[:1]:

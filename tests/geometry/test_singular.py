@@ -10,16 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from facejax.geometry import align, sphere, srvf
+from facejax import augment
+from facejax.geometry import align, rbf, sphere, srvf
+from tests.near import COUNT, finite
 
-COUNT = 100_000
 STEPS, LANDMARKS = 3, 2
-
-
-@pytest.fixture(params=["float32", "float64"])
-def dtype(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
 
 
 def pairs(dtype):
@@ -54,23 +49,6 @@ def curves(dtype):
     return jnp.asarray(np.concatenate([np.zeros_like(steps[:, :1]), np.cumsum(steps, axis=1)], axis=1), dtype)
 
 
-def finite(function, *arrays, where=None):
-    """The values, checked with the gradients by every array."""
-    made = function(*arrays)
-    rng = np.random.default_rng(2)
-    weights = [jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype) for leaf in jax.tree.leaves(made)]
-
-    def total(*arrays):
-        return sum(jnp.sum(w * leaf) for w, leaf in zip(weights, jax.tree.leaves(function(*arrays)), strict=True))
-
-    slopes = jax.jit(jax.grad(total, argnums=tuple(range(len(arrays)))))(*arrays)
-    for leaf in [*jax.tree.leaves(made), *slopes]:
-        bad = ~np.isfinite(np.asarray(leaf)).reshape(len(leaf), -1).all(axis=1)
-        assert not bad.any(), f"{bad.sum()} of {len(bad)}, first {np.argmax(bad)}"
-        assert leaf.dtype == arrays[0].dtype
-    return made
-
-
 def length(v):
     return np.sqrt(np.einsum("ktlc,ktlc->k", v, v, dtype=np.float64) / STEPS)
 
@@ -98,6 +76,14 @@ def test_the_sphere(dtype):
     for function in (sphere.inner, sphere.project):
         finite(function, p, q)
     finite(sphere.norm, p - q)
+
+
+def test_roots(dtype):
+    squared = 10.0 ** np.random.default_rng(4).uniform(-80, 30, COUNT)  # in float32 nearly half of them are 0
+    squared[:100] = 0
+    squared = np.asarray(squared, dtype)
+    squared[squared < np.finfo(dtype).tiny] = 0  # as XLA has it
+    np.testing.assert_allclose(finite(sphere.root, jnp.asarray(squared)), np.sqrt(squared), rtol=1e-6)
 
 
 def test_means(dtype):
@@ -163,3 +149,70 @@ def test_resampling(dtype, by):
     low, high = np.asarray(curve).min(axis=1), np.asarray(curve).max(axis=1)
     slack = 8 * np.finfo(dtype).eps * np.abs(np.asarray(curve)).max(axis=1)
     assert (found >= (low - slack)[:, None]).all() and (found <= (high + slack)[:, None]).all()
+
+
+def test_transitions(dtype):
+    p, q, _ = pairs(dtype)
+    sizes = jnp.asarray(np.random.default_rng(5).uniform(-9, 9, (2, COUNT)), dtype)
+    starts = jnp.zeros((COUNT, LANDMARKS, 3), dtype)
+    found = np.asarray(
+        finite(lambda *both: augment.transition(*both, starts, starts, frames=4), p, sizes[0], q, sizes[1])
+    )
+    for frame, end, size in ((0, p, sizes[0]), (-1, q, sizes[1])):
+        wanted = np.asarray(srvf.displacement(end, size)).sum(axis=1)
+        off = np.abs(found[:, frame] - wanted).max(axis=(1, 2)) / np.exp(np.asarray(size))
+        assert off[15:].max() < 64 * np.finfo(dtype).eps  # before them, one of both is at standstill, and on no sphere
+
+
+def test_halves(dtype):
+    curve = curves(dtype)
+    peak = augment.apex(curve)
+    found = finite(lambda curve: augment.halves(curve, peak, frames=3), curve)
+    highest = np.asarray(curve)[np.arange(COUNT), np.asarray(peak)]
+    np.testing.assert_array_equal(found[0][:, 0], curve[:, 0])
+    np.testing.assert_array_equal(found[0][:, -1], highest)
+    np.testing.assert_array_equal(found[1][:, 0], highest)
+    np.testing.assert_array_equal(found[1][:, -1], curve[:, -1])
+
+
+def landmarks(rng):
+    """Five landmarks: two of them near one another, all near a plane or a line, far from the origin, large or small."""
+    rest = rng.normal(size=(5, 3))
+    kind = rng.integers(4)
+    if kind == 0:
+        rest[1] = rest[0] + 10.0 ** rng.uniform(-14, 0) * rng.normal(size=3)
+    elif kind == 1:
+        rest[:, 2] *= 10.0 ** rng.uniform(-14, 0)
+    elif kind == 2:
+        rest[:, 1:] *= 10.0 ** rng.uniform(-14, 0)
+    rest += 10.0 ** rng.uniform(-2, 4) * rng.normal(size=3) * rng.integers(2)
+    return 10.0 ** rng.uniform(-6, 6) * rest
+
+
+@pytest.mark.parametrize("count", [2_000, pytest.param(COUNT, marks=pytest.mark.slow)])
+def test_warps(count):
+    """Landmarks are refused, or met and affine motions carried on."""
+    rng, refused = np.random.default_rng(6), 0
+    for _ in range(count):
+        rest = landmarks(rng)
+        try:
+            found = rbf.fit(rest, kernel=str(rng.choice(list(rbf.KERNELS))))
+        except ValueError:
+            refused += 1
+            continue
+        # float32 keeps of a place only so much, and the system is solved in units of the landmarks' distances.
+        weights = rbf.weights(found, rest)
+        assert np.abs(weights - np.eye(5)).max() < 1e-4
+        assert np.isfinite(rbf.weights(found, rest[:3] + np.ptp(rest) * rng.normal(size=(3, 3)))).all()
+    assert 0 < refused < count
+
+
+@pytest.mark.parametrize("kernel", rbf.KERNELS)
+def test_kernels(kernel):
+    squared = np.append(0, np.sort(10.0 ** np.random.default_rng(7).uniform(-300, 60, COUNT)))
+    with jax.enable_x64(True):
+        value = np.asarray(rbf.KERNELS[kernel].phi(jnp, jnp.asarray(squared)))
+    assert np.isfinite(value).all()
+    np.testing.assert_allclose(value, rbf.KERNELS[kernel].phi(np, squared), rtol=1e-9, atol=1e-300)
+    if rbf.KERNELS[kernel].definite:
+        assert value[0] == 1 and value[-1] == 0 and (np.diff(value) < 1e-15).all()
