@@ -105,10 +105,8 @@ def _step(name: str, loss: Callable, weights, batch, constants, axis: int, repea
         state = steps.start_supervised(weights, optax.adam(1e-3), jax.random.key(0))
         return _work.onward(step, state, batch, constants)
 
-    one, several = onward(step), onward(shared)
-    for _ in range(3):
-        _equal.check(one()["loss"], several()["loss"], tolerance=1e-5)
     sides = {"facejax": onward(_work.scanned(shared, SCAN)), "one device": onward(_work.scanned(step, SCAN))}
+    _equal.check(*(side()["loss"] for side in sides.values()), tolerance=1e-5)
     calls, items = dict.fromkeys(sides, SCAN), batch[0].shape[axis]
     return _shared(
         _measure.row(name, sides, peers=["one device"], repeats=repeats, calls=calls, items=items, unit="samples")

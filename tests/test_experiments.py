@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import (
+    _cases,
     _interpolated,
     classification,
     composed,
@@ -19,7 +20,7 @@ from experiments import (
     specificity,
     unseen_subjects,
 )
-from facejax import augment, evaluation, expressions, motion_examples
+from facejax import augment, evaluation, expressions, fit_gpmm, motion_examples
 from facejax.data import makehuman4d, motions
 
 TINY = {"subjects": 6, "meshes": 260}
@@ -45,7 +46,8 @@ def check(out, *fields):
     return metrics
 
 
-def test_dataset_card(own_cache, tmp_path):
+def test_dataset_card(own_cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(_cases, "FOLDS", 2)
     dataset_card.run(dataset_card.Config(out=tmp_path / "o", levels=(0,), **TINY))
     metrics = check(tmp_path / "o", "levels", "speed_mm_per_s")
     errors = metrics["levels"]["0"]["error_mm"]["subjects"]
@@ -62,7 +64,12 @@ def test_unseen_subjects(own_cache, tmp_path):
     assert all(r["mean_mm"] > 0 for r in rows)
 
 
-def test_pretrain(own_cache, tmp_path):
+def test_pretrain(own_cache, tmp_path, monkeypatch):
+    monkeypatch.setattr(motion_examples, "SPREAD", 8)
+    monkeypatch.setattr(motion_examples, "CHARTED", 8)
+    monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
+    monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.12,))
+    monkeypatch.setattr(fit_gpmm, "NOISE", (1e-2,))
     config = pretrain.Config(out=tmp_path / "o", level=1, motion_steps=2, decoder_steps=2, **TINY)
     pretrain.run(config)
     metrics = check(tmp_path / "o", "error_mm", "seconds")

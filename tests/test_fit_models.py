@@ -11,8 +11,10 @@ PLANS = fit_models.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Pla
 
 @pytest.fixture(scope="module")
 def few():
-    """Few candidates for the prior."""
+    """Few candidates for the prior, few motions."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(motion_examples, "SPREAD", 8)
+        patch.setattr(motion_examples, "CHARTED", 8)
         patch.setattr(fit_gpmm, "FOLDS", 2)
         patch.setattr(fit_gpmm, "SMOOTH", (0.12,))
         patch.setattr(fit_gpmm, "NOISE", (1e-2,))

@@ -103,8 +103,10 @@ def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
     """The boundary's closed loops, each as its vertices in the order in which its triangles run."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    inner = {(b, a) for a, b in directed.tolist()}
-    follows = {a: b for a, b in directed.tolist() if (a, b) not in inner}
+    ahead, back = (
+        np.ravel_multi_index(edge.T, (np.max(faces, initial=0) + 1,) * 2) for edge in (directed, directed[:, ::-1])
+    )
+    follows = dict(directed[~np.isin(ahead, back)].tolist())
     loops = []
     while follows:
         loop = [next(iter(follows))]
