@@ -59,7 +59,7 @@ def _generate(command: Generate) -> None:
 
 
 def _corpus(command: Generate) -> None:
-    from facejax import corpus, produce
+    from facejax import corpus, supply
 
     for name in ("samples", "fps", "formats", "landmarks"):
         if getattr(command, name) != getattr(Generate, name):
@@ -75,7 +75,7 @@ def _corpus(command: Generate) -> None:
         command.count, labels, command.seed, command.frames, command.intensity, command.meshes, command.shard
     )
     _said(
-        produce.generate_corpus(
+        supply.generate_corpus(
             request, command.out, face=command.face, people=command.people, model=command.model,
             distributed=command.distributed,
         )
@@ -165,12 +165,12 @@ def _labels(command: Labels) -> None:
 
 
 def _data(command: Data) -> None:
-    from facejax import produce
+    from facejax import supply
     from facejax.data import makehuman4d
 
     command = command.what
     if isinstance(command, Prepare):
-        made = produce.prepare_recordings(
+        made = supply.prepare_recordings(
             command.source, command.root, command.out, landmarks=command.landmarks, unit=command.unit,
             labels=command.labels, people=command.people, cuts=command.cuts, hold=command.hold, most=command.meshes,
             workers=command.workers, rate=command.fps, rest=command.rest, gaps=command.gaps, template=command.template,
@@ -179,16 +179,18 @@ def _data(command: Data) -> None:
         splits = [f"{split}: {', '.join(names)}" for split, names in made.people().items() if names]
         _said(([made.path], (*made.index["notes"], *splits)))
     elif command.sample is not None:
-        print("\n".join(str(path) for path in produce.sample_faces(command.sample, command.count)))
+        print("\n".join(str(path) for path in supply.sample_faces(command.sample, command.count)))
     else:
         spec = makehuman4d.Spec(level=command.level, head_motion=command.head_motion, noise=command.noise)
-        print(produce.prepare(spec, folder=command.out))
+        print(supply.prepare(spec, folder=command.out))
 
 
 def _fit(command: Fit) -> None:
-    from facejax import produce
+    from facejax import supply
 
-    path, errors = produce.fit(command.data, command.out, quick=command.quick, seed=command.seed)
+    path, errors = supply.fit(
+        command.data, command.out, quick=command.quick, seed=command.seed, distributed=command.distributed
+    )
     if errors:
         print("people held out: {head:.3f} mm over the mesh, {face:.3f} mm over the face".format(**errors))
     print(path)

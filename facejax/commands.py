@@ -223,6 +223,8 @@ class Fit:
     """Of the initial weights and the order of the data."""
     quick: bool = False
     """A few steps only, to see that everything is in order."""
+    distributed: bool = False
+    """Share each batch with the other processes of a job, see `facejax.runtime.join`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jax.sharding import Mesh
 
 from facejax import evaluation, fit_gpmm, fit_motion, fit_residual, motion_examples, pipeline
 from facejax.data import makehuman, meshes, motions, store
@@ -27,8 +28,13 @@ class Plans(NamedTuple):
     residual: fit_residual.Plan = fit_residual.Plan()
 
 
-def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 0) -> pipeline.Models:
-    """Train on the training subjects of a store. Raises `ValueError` where it holds too little to learn from."""
+def fit(
+    data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
+) -> pipeline.Models:
+    """Train on the training subjects of a store; `mesh` as in `training.run`.
+
+    Raises `ValueError` where the store holds too little to learn from.
+    """
     check(data)
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
@@ -40,12 +46,14 @@ def fit(data: store.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 
     examples = motion_examples.examples_of(
         chart, motion_examples.everything(data, "train", names=data.labels, per_pair=motion_examples.SPREAD)
     )
-    generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed)
+    generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed, mesh=mesh)
     beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train"))
     train = meshes.of_split(data, "train")
     # As many components as the file will hold: the network refines the very answer that it will meet.
     base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
-    expander = fit_residual.fit(train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base)
+    expander = fit_residual.fit(
+        train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, mesh=mesh
+    )
     return pipeline.Models(
         labels=data.labels,
         face=pipeline.Face(mean, faces, at, np.zeros(0, np.int32), attachment.region(mean, faces, at)),

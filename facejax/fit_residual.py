@@ -18,7 +18,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from facejax import expand, fit_gpmm, journal, steps, training, weights
+from facejax import expand, fit_gpmm, journal, parallel, steps, training, weights
 from facejax.data.meshes import Meshes
 from facejax.mesh import strain
 from facejax.mesh.topology import Hierarchy
@@ -107,7 +107,9 @@ def fit(
     fitted = expand.Params(base.params, network, hierarchy, tables)
     network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
     # What was judged is kept: the answers that it was judged by take a minute to come by.
-    weights.save(done, network._asdict())
+    if parallel.is_first():
+        weights.save(done, network._asdict())
+    parallel.meet("the network is written")
     return fitted._replace(network=network)
 
 

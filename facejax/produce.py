@@ -1,4 +1,4 @@
-"""What the command line does: files in, files out, progress on standard error."""
+"""What the command line does to faces: files in, animations out, progress on standard error."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax import animation, corpus, drive, files, io, pipeline, results, runtime, scanned
-from facejax.data import assets, livelink, makehuman, makehuman4d, noise, portrait, store
+from facejax import animation, drive, files, io, pipeline, results, runtime, scanned
+from facejax.data import assets, livelink, makehuman, portrait
 from facejax.io import dress, faces
-
-MOST_PEOPLE = 1000  # of whom a corpus may be
 
 
 def generate(
@@ -64,35 +62,6 @@ def generate(
     return written
 
 
-def generate_corpus(
-    request: corpus.Request,
-    out: Path,
-    *,
-    face: Path | None = None,
-    people: int = 0,
-    model: Path | None = None,
-    distributed: bool = False,
-) -> tuple[list[Path], tuple[str, ...]]:
-    """Write a corpus of motions of one face or of so many MakeHuman people; its index, and what was assumed."""
-    if distributed:
-        runtime.join()
-    runtime.start()
-    if not 0 <= people <= MOST_PEOPLE:
-        raise ValueError(f"--people must lie in 0..{MOST_PEOPLE}, got {people}")
-    models, notes = pipeline.load(model), ()
-    if people:
-        if not np.array_equal(models.face.faces, assets.load().faces):
-            raise ValueError(f"{model}: is in another topology than MakeHuman's people; leave --people out")
-        neutrals = {who.name: who.vertices for who in map(makehuman.subject, range(people))}
-    else:
-        vertices, notes = neutral_face(face, model)
-        neutrals = {"average" if face is None else face.stem: vertices}
-    results.writable(out)
-    with results.progress(out.name, None) as advance:
-        found = corpus.generate(models, request, neutrals, out, progress=advance)
-    return [found.path / "index.json"], tuple(f"{face}: {note}" for note in notes)
-
-
 def neutral_face(path: Path | None, model: Path | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """A user's neutral face in the model's topology, or the average face; and what was assumed about it."""
     face = pipeline.load(model).face
@@ -108,61 +77,6 @@ def neutral_face(path: Path | None, model: Path | None = None) -> tuple[np.ndarr
 def labels(model: Path | None = None) -> tuple[str, ...]:
     """The labels that the model knows."""
     return pipeline.load(model).labels
-
-
-def sample_faces(out: Path, count: int) -> list[Path]:
-    """Neutral faces of test subjects as PLY files."""
-    if not 1 <= count <= 1000:
-        raise ValueError(f"--count must lie in 1..1000, got {count}")
-    topology = assets.load().faces
-    people = [makehuman.subject(100 + i) for i in range(count)]
-    results.writable(out)
-    paths = [out / f"{person.name}.ply" for person in people]
-    for path, person in zip(paths, people, strict=True):
-        io.save(path, person.vertices, topology)
-    return paths
-
-
-def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
-    """Make a makehuman4d, or find it made; returns its folder."""
-    noise.check(spec.noise)
-    if folder is not None:
-        results.writable(folder)
-    with results.progress(spec.name, spec.subjects) as advance:
-        return makehuman4d.prepare(spec, folder=folder, progress=lambda done, total: advance(done)).path
-
-
-def fit(data: Path, out: Path, *, quick: bool = False, seed: int = 0) -> tuple[Path, dict[str, float]]:
-    """Train models on a store and write them; the file, and what is off on people held out (mm, by region).
-
-    Checkpoints lie beside it, in a folder of its name; called again, a stopped training goes on there. `quick`: a few
-    steps, to see that everything is in order.
-    """
-    from facejax import fit_models, fit_motion, fit_residual
-
-    runtime.start()
-    found = store.open_store(data)
-    fit_models.check(found)
-    if out.suffix != ".safetensors":
-        raise ValueError(f"--out {out}: expected a file that ends in .safetensors")
-    results.writable(out.parent)
-    plans = fit_models.Plans()
-    if quick:
-        plans = fit_models.Plans(fit_motion.FlowPlan(steps=200), fit_residual.Plan(steps=50))
-    models = fit_models.fit(found, out.with_suffix(".training"), plans=plans, seed=seed)
-    errors = fit_models.judge(models, found)
-    pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))
-    return out, errors
-
-
-def prepare_recordings(layout: str, root: Path, out: Path, **options) -> store.Store:
-    """Read a user's recordings into a dataset (`facejax.data.layouts.prepare`), with a progress bar."""
-    from facejax.data import layouts
-
-    if (rate := options.get("rate")) is not None:
-        results.check_rate(rate)
-    with results.progress(out.name, None) as advance:
-        return layouts.prepare(layout, root, out, progress=advance, **options)
 
 
 def view(path: Path, out: Path | None = None, *, fps: float | None = None) -> Path:

@@ -83,10 +83,11 @@ def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
 
     def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         own, shared = constants
-        count = max(n for n in range(1, jax.device_count() + 1) if len(ids) % n == 0)
+        devices = jax.local_devices()  # other processes, where there are any, do the same
+        count = max(n for n in range(1, len(devices) + 1) if len(ids) % n == 0)
         apart = several
         if count > 1:
-            mesh, split = Mesh(np.array(jax.devices()[:count]), ("models",)), PartitionSpec("models")
+            mesh, split = Mesh(np.array(devices[:count]), ("models",)), PartitionSpec("models")
             specs = {"in_specs": (PartitionSpec(), split), "out_specs": split}
             apart = jax.shard_map(several, mesh=mesh, check_vma=False, **specs)
         stacked = (state.params, state.opt_state, state.extra, ids, batch, own)

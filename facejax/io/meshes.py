@@ -85,7 +85,9 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
     first = _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
     extra = {"landmarks": found["landmarks"]} if "landmarks" in found else {}
     if "fps" in found:
-        extra["fps"] = float(found["fps"].ravel()[0])
+        if found["fps"].size != 1 or found["fps"].dtype.kind not in "fiu":
+            raise MeshError(f"{path}: fps must be one number, got {found['fps'].shape} {found['fps'].dtype}")
+        extra["fps"] = float(found["fps"].item())
     return vertices, first.faces if bare else faces.astype(np.int32), extra
 
 
@@ -212,8 +214,11 @@ def _told(path: Path, reader, *options):
 
 
 def _checked(path: Path, vertices, faces) -> Mesh:
+    vertices = np.asarray(vertices)
+    if vertices.dtype.kind not in "fiu":
+        raise MeshError(f"{path}: vertices must be real numbers, got {vertices.dtype}")
     with np.errstate(invalid="ignore"):  # of numbers that are none: refused below
-        vertices = np.array(vertices, np.float64)
+        vertices = vertices.astype(np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(f"{path}: vertices must be (N, 3), got {vertices.shape}")
     if not len(vertices):
@@ -221,7 +226,7 @@ def _checked(path: Path, vertices, faces) -> Mesh:
     if not np.isfinite(vertices).all():  # row by row, as below, would take ten times as long
         bad = np.flatnonzero(~np.isfinite(vertices).all(1))
         raise MeshError(f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)")
-    if faces is None or not len(faces):
+    if faces is None or not np.size(faces):
         return Mesh(vertices, None)
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":

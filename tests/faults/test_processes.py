@@ -10,6 +10,8 @@ import time
 import numpy as np
 import pytest
 
+from facejax import pipeline
+from facejax.data import corpora
 from tests.faults import loops
 from tests.faults._record import TRIES, outcome
 from tests.faults.test_kills import LOOP, contents, finished, started
@@ -83,6 +85,30 @@ def test_two_processes_train_as_one_and_another_number_goes_on(tmp_path):
         )
 
 
+@pytest.mark.slow
+def test_models_of_ones_own_are_fitted_by_two_processes(tiny_store, tmp_path):
+    command = [sys.executable, "-m", "facejax.cli", "fit", "--data", tiny_store.path, "--quick", "--out"]
+    finished(started([*command, tmp_path / "alone.safetensors"]))
+    pair = together(2, [*command, tmp_path / "both.safetensors", "--distributed"])
+    # JAX's own lines of who is connected to whom stand first.
+    said = [finished(process).splitlines()[-2:] for process in pair]
+    assert said[0] == said[1] and said[0][-1] == str(tmp_path / "both.safetensors")
+    for stage in ("motion", "meshes"):
+        assert_alike(*(tmp_path / f"{name}.training" / stage for name in ("both", "alone")))
+    one, two = (pipeline.load(tmp_path / f"{name}.safetensors") for name in ("alone", "both"))
+    assert two.about["error_mm"] == pytest.approx(one.about["error_mm"], rel=0.01)
+    outcome("2 processes", "facejax fit --distributed", 1, "the losses of one, and its errors on people held out")
+
+
+@pytest.mark.slow
+def test_networks_side_by_side_are_the_same_in_two_processes(tmp_path):
+    command = [sys.executable, LOOP, "expressions"]
+    alone = finished(started([*command, tmp_path / "alone"])).split()[-1]
+    pair = together(2, [*command, tmp_path / "both", "--distributed"])
+    assert {finished(process).split()[-1] for process in pair} == {alone}
+    outcome("2 processes", "training, expressions", 1, "the bits of one")
+
+
 def assert_alike(folder, other):
     for a, b in zip(entries(folder), entries(other), strict=True):
         assert a["step"] == b["step"]
@@ -98,8 +124,6 @@ def test_a_corpus_is_the_same_on_one_and_on_four_devices_and_of_two_processes(tm
     for process in together(2, [*GENERATE, "--out", tmp_path / "two", "--distributed"]):
         finished(process)
     assert contents(tmp_path / "two") == contents(tmp_path / "one")
-    from facejax.data import corpora
-
     one, four = (corpora.load(tmp_path / name) for name in ("one", "four"))
     for a, b in zip(one, four, strict=True):
         size = np.abs(a["landmarks"] - a["landmarks"][:, :1]).max()
