@@ -37,7 +37,7 @@ slow: setup
 faults: setup
 	@mkdir -p runs && rm -f runs/faults.jsonl
 	FACEJAX_FAULT_TRIES=50 FACEJAX_FAULT_FILES=20000 FACEJAX_FAULT_RECORD=$(CURDIR)/runs/faults.jsonl \
-	  $(BIN)/python -m pytest -n 2 -m "slow or not slow" tests/faults tests/geometry/test_singular.py
+	  $(BIN)/python -m pytest -n 2 -m "slow or not slow" tests/faults tests/geometry/test_singular.py tests/mesh/test_singular_meshes.py tests/test_singular_losses.py
 	$(BIN)/python tests/faults/table.py runs/faults.jsonl
 
 browser: setup

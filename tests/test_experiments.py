@@ -65,8 +65,8 @@ def test_unseen_subjects(own_cache, tmp_path):
 
 
 def test_pretrain(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(motion_examples, "SPREAD", 8)
-    monkeypatch.setattr(motion_examples, "CHARTED", 8)
+    monkeypatch.setattr(motion_examples, "SPREAD", 2)
+    monkeypatch.setattr(motion_examples, "CHARTED", 2)
     monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
     monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.12,))
     monkeypatch.setattr(fit_gpmm, "NOISE", (1e-2,))

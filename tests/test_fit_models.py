@@ -13,8 +13,8 @@ PLANS = fit_models.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Pla
 def few():
     """Few candidates for the prior, few motions."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion_examples, "SPREAD", 8)
-        patch.setattr(motion_examples, "CHARTED", 8)
+        patch.setattr(motion_examples, "SPREAD", 2)
+        patch.setattr(motion_examples, "CHARTED", 2)
         patch.setattr(fit_gpmm, "FOLDS", 2)
         patch.setattr(fit_gpmm, "SMOOTH", (0.12,))
         patch.setattr(fit_gpmm, "NOISE", (1e-2,))
@@ -84,7 +84,8 @@ def test_what_cannot_be_learnt_from_is_named(tiny_store):
 def test_the_command_trains_and_says_what_it_made(few, tiny_store, tmp_path, monkeypatch, capsys):
     given = {}
 
-    def fit(data, folder, *, plans, seed):
+    def fit(data, folder, *, plans, seed, mesh):
+        assert mesh is None  # of one device
         given.update(data=data.path, folder=folder, plans=plans, seed=seed)
         return pipeline.load()
 

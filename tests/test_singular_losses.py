@@ -1,4 +1,4 @@
-"""Losses and measures of 100,000 samples near where their roots and ratios break down; both precisions."""
+"""Losses and measures of many samples near where their roots and ratios break down; both precisions."""
 
 import jax
 import jax.numpy as jnp

@@ -215,5 +215,5 @@ def test_well_formed_nonsense_is_refused_or_taken(name):
             assert [p.name for p in Path(folder).rglob("*")] == [path.name]
 
     read()
-    assert refused
-    outcome("well-formed nonsense", name, taken + refused, f"{refused:,} refused in one line, {taken:,} read")
+    assert taken + refused >= EXAMPLES // 2  # it may find that there are no more
+    outcome("well-formed nonsense", name, taken + refused, "", refused=refused, read=taken)

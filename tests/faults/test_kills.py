@@ -73,7 +73,7 @@ def test_a_training_that_is_killed_ends_with_the_same_bits(loop, tmp_path):
             if not alive or last == loops.STEPS:
                 break
         assert finished(started([sys.executable, LOOP, loop, folder])).split()[-1] == whole
-    outcome("kill -9", f"training, {loop}", kills, "resumed to the same bits")
+    outcome("kill -9", f"training {loop}", kills, "resumed to the same bits")
 
 
 def contents(folder):

@@ -1,4 +1,4 @@
-"""Laws over 100,000 random points near the sets where formulas break down, values and gradients, in both precisions.
+"""Laws over many random points near the sets where formulas break down, values and gradients, in both precisions.
 
 Points are pairs at angles from 1e-12 to pi less 1e-12 and exactly 0 and pi; motions are curves in units from 1e-12 to
 1e12 with pauses, steps that differ by twelve orders, and standstill; clouds are flat, thin, single points and mirror
@@ -189,11 +189,10 @@ def landmarks(rng):
     return 10.0 ** rng.uniform(-6, 6) * rest
 
 
-@pytest.mark.parametrize("count", [2_000, pytest.param(COUNT, marks=pytest.mark.slow)])
-def test_warps(count):
-    """Landmarks are refused, or met and affine motions carried on."""
+def test_warps():
+    """Landmarks are refused, or met."""
     rng, refused = np.random.default_rng(6), 0
-    for _ in range(count):
+    for _ in range(COUNT):
         rest = landmarks(rng)
         try:
             found = rbf.fit(rest, kernel=str(rng.choice(list(rbf.KERNELS))))
@@ -204,7 +203,7 @@ def test_warps(count):
         weights = rbf.weights(found, rest)
         assert np.abs(weights - np.eye(5)).max() < 1e-4
         assert np.isfinite(rbf.weights(found, rest[:3] + np.ptp(rest) * rng.normal(size=(3, 3)))).all()
-    assert 0 < refused < count
+    assert 0 < refused < COUNT
 
 
 @pytest.mark.parametrize("kernel", rbf.KERNELS)

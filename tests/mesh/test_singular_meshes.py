@@ -1,4 +1,4 @@
-"""Laws on 100,000 fans of triangles that are thin, folded, shrunk to a line or to a point; both precisions."""
+"""Laws on many fans of triangles that are thin, folded, shrunk to a line or to a point; both precisions."""
 
 import jax.numpy as jnp
 import numpy as np
