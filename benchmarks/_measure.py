@@ -97,7 +97,7 @@ def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -
         rows, sizes = run(config)
     except (ValueError, RuntimeError, OSError, AssertionError, IndexError, ZeroDivisionError) as error:
         said = f"ours and a peer's differ: {error}" if isinstance(error, AssertionError) else str(error)
-        print(f"benchmarks.{name}: {' '.join(said.split())}", file=sys.stderr)
+        print(f"benchmarks.{name}: {files.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None
     print(table(rows))
     if sizes:

@@ -41,7 +41,7 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
         _check_publish(config)
         run(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"experiments.{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"experiments.{name}: {files.one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from error
     print(f"results in {config.out}")
 

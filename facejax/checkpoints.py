@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from facejax import weights
+from facejax import files, weights
 
 Tree = Any
 
 
-class CheckpointError(ValueError):
+class CheckpointError(files.FileError):
     """A checkpoint that is missing, damaged, written by another model, or could not be written."""
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import tyro
 
+from facejax import files
 from facejax.commands import Animate, Command, Data, Demo, Fit, Generate, Labels, Prepare, Register, View
 
 
@@ -26,7 +27,7 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"facejax: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"facejax: {files.one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from None
 
 
@@ -141,7 +142,7 @@ def _said(result: tuple[list[Path], tuple[str, ...]]) -> None:
     """Print what was assumed to standard error, and the files to standard output."""
     done, notes = result
     for note in notes:
-        print(note, file=sys.stderr)
+        print(files.one_line(note), file=sys.stderr)
     print("\n".join(str(path) for path in done))
 
 

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Files appear whole or not at all; what is said of a stranger's is one line."""
 
 import contextlib
 import hashlib
@@ -7,6 +7,23 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+SAID = 1000  # characters of a message, or little more
+
+
+class FileError(ValueError):
+    """A file that cannot be used. The message is one printable line, whatever of the file it quotes."""
+
+    def __init__(self, message: str):
+        super().__init__(one_line(message))
+
+
+def one_line(text: object) -> str:
+    """A text in one line, without what a terminal would act on; of a very long one the beginning and the end."""
+    text = str(text)
+    if len(text) > SAID:
+        text = f"{text[: SAID // 2]} ... {text[-SAID // 2 :]}"
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 @contextlib.contextmanager

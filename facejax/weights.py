@@ -29,7 +29,7 @@ _DTYPES |= {
 }
 
 
-class WeightsError(ValueError):
+class WeightsError(files.FileError):
     """A weights file that is missing, damaged, or made for another model."""
 
 

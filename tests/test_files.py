@@ -26,3 +26,10 @@ def test_replacing_folder_replaces_or_vanishes(tmp_path):
         with files.replacing_folder(target) as temporary:
             (temporary / "x").write_text(text)
         assert (target / "x").read_text() == text
+
+
+def test_what_is_said_of_a_file_is_one_short_printable_line():
+    said = str(files.FileError("/a b.ply: names\n\x1b[31mred\u202e\tand " + 9_000_000 * "x" + ": leave it out"))
+    assert said.startswith("/a b.ply: names [31mred and xxx") and said.endswith("xxx: leave it out")
+    assert said.isprintable() and len(said) <= files.SAID + 5
+    assert files.one_line(ValueError("ä short one")) == "ä short one"

@@ -34,7 +34,7 @@ class Shard(NamedTuple):
     sha256: str
 
 
-class CorpusError(ValueError):
+class CorpusError(files.FileError):
     """A corpus that is not whole, or no corpus."""
 
 

@@ -31,6 +31,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from facejax import files
 from facejax.data import rig
 
 _SIDED = ("Left", "Right")
@@ -57,7 +58,7 @@ WEIGHTS = (-0.5, 2.0)  # ARKit's lie in 0..1, a little above now and then
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,3}(?:\.\d{1,9})?)")
 
 
-class RecordingError(ValueError):
+class RecordingError(files.FileError):
     """A recording cannot be used; the message names the file, the line and the column."""
 
 

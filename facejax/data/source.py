@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from facejax import files
 from facejax.io import meshes
 
 ALIKE = 3.0  # no mesh of a dataset is so many times as large as another: faces are not, but other units are
@@ -22,7 +23,7 @@ ALIKE = 3.0  # no mesh of a dataset is so many times as large as another: faces 
 Frame = tuple[str, meshes.Mesh]  # the name for messages, and the mesh
 
 
-class SourceError(ValueError):
+class SourceError(files.FileError):
     """Recordings cannot be used; the message names the file or folder, what was expected and what is there."""
 
 

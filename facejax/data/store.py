@@ -19,12 +19,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from facejax import files
+
 SCHEMA = 1
 INDEX_BYTES = 3 * 2**23  # of an index: thirty times as many when it is read
 SPLITS = ("train", "validation", "test")
 
 
-class StoreError(ValueError):
+class StoreError(files.FileError):
     """A store is missing, incomplete or of another schema."""
 
 

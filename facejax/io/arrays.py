@@ -77,10 +77,7 @@ def map_npy(path: Path) -> np.ndarray:
 
 def skip_object_header(stream) -> None:
     """Go to the pickle of an NPY file that holds one object. Raises `ValueError` for any other."""
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"unknown array format {version}")
-    shape, _, dtype = _HEADERS[version](stream)
+    shape, _, dtype = _described(stream)
     if shape != () or not dtype.hasobject:
         raise ValueError(f"expected one object, got {shape} {dtype}")
 
@@ -113,15 +110,20 @@ def _header(stream, size: int, name: str, *, limit: int | None = LIMIT) -> tuple
     """Shape, order, type and bytes that the header claims, held against the size."""
     if limit is not None and size > limit:
         raise ValueError(f"{name}: {size} bytes, more than {limit}")
-    version = np.lib.format.read_magic(stream)
-    if version not in _HEADERS:
-        raise ValueError(f"{name}: unknown array format {version}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of how slow a header of Python 2 is
-        shape, fortran, dtype = _HEADERS[version](stream)
+    shape, fortran, dtype = _described(stream)
     if dtype.hasobject or dtype.kind not in "fiu":
         raise ValueError(f"{name}: must hold numbers, got {dtype}")
     need, there = math.prod(shape) * dtype.itemsize, size - stream.tell()
     if need != there:
         raise ValueError(f"{name}: {shape} {dtype} needs {need} bytes, the file holds {there}")
     return shape, fortran, dtype, need
+
+
+def _described(stream) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type in a header."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"unknown array format {version}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of how slow a header of Python 2 is
+        return _HEADERS[version](stream)

@@ -31,7 +31,7 @@ _KINDS = (("indices",), ("faces", "weights"), ("points",))
 _ROWS = {1: "index", 3: "x y z", 4: "index x y z"}
 
 
-class LandmarkError(ValueError):
+class LandmarkError(files.FileError):
     """A landmark file cannot be used; the message names the file, the line or entry, and what was expected."""
 
 

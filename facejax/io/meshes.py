@@ -24,7 +24,7 @@ _LINE_LIMIT = 2**20
 _FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
 
 
-class MeshError(ValueError):
+class MeshError(files.FileError):
     """A mesh file cannot be used; the message names the file, what is wrong and where."""
 
 

@@ -18,11 +18,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from facejax import files
+
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
 LIMIT = 2**23  # bytes: an empty list of one byte takes 64
 
 
-class PickleError(ValueError):
+class PickleError(files.FileError):
     """A pickle cannot be read, or holds what is not let through; the message names the file."""
 
 
