@@ -10,7 +10,7 @@ help:
 	@echo "make demo    set up, then animate three unseen faces into runs/demo"
 	@echo "make test    set up, then run the tests"
 	@echo "make slow    the slow tests, by hand"
-	@echo "make faults  kills, full disks, lost processes and 20,000 damaged files per reader, an hour"
+	@echo "make faults  kills, full disks, lost processes and 20,000 damaged files per reader, half an hour"
 	@echo "make browser the tests that need Chromium and Node, see README"
 	@echo "make lint    ruff"
 	@echo "make bench   the benchmarks with their peers, a quarter of an hour; BENCH='--quick' and other options"

@@ -25,7 +25,7 @@ from facejax import files
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results")
-NAMES = ("srvf", "augment", "motion", "lstm", "decoder", "rbf", "linear", "pipeline", "data")
+NAMES = ("srvf", "augment", "motion", "lstm", "decoder", "rbf", "linear", "pipeline", "data", "scale")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
     try:
         return compare(config) if comparing else everything(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"benchmarks: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"benchmarks: {files.one_line(error)}", file=sys.stderr)
         return 2
 
 

@@ -40,6 +40,11 @@ WORKS = (
     Work("fresh_process_warm_cache", "the same, compilation cache warm", ""),
     Work("s2d_training_20000_meshes", "a step of S2D-Dec's training on 20,000 meshes, in the loop", "under 2 GB"),
     Work("transitions_300000_performed", "300,000 peak → peak transitions between 1,440 onsets, streamed", ""),
+    Work("lstm_step_devices", "LSTM step of 32 sequences, each core a device", "", ("one device",)),
+    Work("s2d_step_devices", "S2D-Dec training step, batch 16, each core a device", "", ("one device",)),
+    Work("corpus_devices", "512 motions of a corpus, each core a device", "", ("one device",)),
+    Work("corpus_10000", "a corpus of 10,000 motions, with its index", ""),
+    Work("corpus_1000000", "a million of them, told from it", ""),
 )
 
 
@@ -60,6 +65,10 @@ def _ours(row: Row) -> str:
         found.append(f"{row['roofline_share']:.0%} of the roofline")
     if row["unit"] in ("meshes", "transitions"):
         found.append(f"{row['per_s']:,.0f} {row['unit']}/s")
+    if "efficiency" in row:
+        found.append(f"efficiency {row['efficiency']:.0%}")
+    if "megabytes" in row:
+        found.append(f"{row['megabytes']:,.0f} MB")
     if "memory_mb" in row and not row["peer"]:
         found.append(f"{row['memory_mb']:,.0f} MB")
     return ", ".join(found)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from facejax import cli
+from tests.faults import table as faults
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -42,6 +43,12 @@ def test_links_and_modules_exist():
         assert (ROOT / target).exists(), target
     for module in set(re.findall(r"python -m (experiments|benchmarks)\.([a-z]\w+)", README)):
         assert (ROOT / module[0] / f"{module[1]}.py").exists(), module
+
+
+def test_the_table_of_faults_is_that_of_the_record():
+    """Of tests/faults/outcomes.jsonl, which `make faults` wrote."""
+    (quoted,) = re.findall(r"<!-- faults -->\n(.*?)\n<!-- end -->", README, re.DOTALL)
+    assert quoted == faults.table(ROOT / "tests" / "faults" / "outcomes.jsonl")
 
 
 def test_result_tables_are_quoted_unchanged():

@@ -107,7 +107,7 @@ def test_networks_side_by_side_are_the_same_in_two_processes(tmp_path):
     alone = finished(started([*command, tmp_path / "alone"])).split()[-1]
     pair = together(2, [*command, tmp_path / "both", "--distributed"])
     assert {finished(process).split()[-1] for process in pair} == {alone}
-    outcome("2 processes", "training, expressions", 1, "the bits of one")
+    outcome("2 processes", "training expressions", 1, "the bits of one")
 
 
 def assert_alike(folder, other):
