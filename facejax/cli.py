@@ -20,15 +20,28 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point of the `facejax` command."""
     command = tyro.cli(Command, prog="facejax", description="4D facial expressions.", args=arguments)
     try:
+        _bounded(command)
         _COMMANDS[type(command)](command)
     except BrokenPipeError:
         # Somebody closed our output, `head` say: that is no error of theirs.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         raise SystemExit(130) from None
-    except (ValueError, RuntimeError, OSError) as error:
-        print(f"facejax: {files.one_line(error)}", file=sys.stderr)
+    except (ValueError, RuntimeError, OSError, MemoryError, OverflowError) as error:
+        said = str(error) or type(error).__name__
+        if isinstance(error, OSError) and error.filename is None and error.strerror:  # a write, which tells no name
+            said = f"{getattr(command, 'out', None) or 'output'} cannot be written: {error.strerror}"
+        print(f"facejax: {files.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _bounded(command: Command) -> None:
+    """Numbers that would fill the memory before anything else could refuse them."""
+    for name, least, most in (("seed", 0, 2**32 - 1), ("frames", 2, 10_000), ("samples", 1, 1_000)):
+        value = getattr(command, name, None)
+        if isinstance(value, int) and not least <= value <= most:
+            more = "; --count writes a corpus of many" if name == "samples" and value > most else ""
+            raise ValueError(f"--{name} must lie in {least}..{most}, got {value}{more}")
 
 
 def _generate(command: Generate) -> None:

@@ -80,7 +80,7 @@ def generate(
 class _Plan(NamedTuple):
     request: Request
     pairs: np.ndarray  # (S or 1, P, 2): what each motion, or all of them, may go through
-    firsts: list[int]
+    firsts: Sequence[int]
     counts: list[int]
     each: int  # bytes of a sequence
     claim: dict[str, Any]
@@ -104,10 +104,10 @@ def _plan(models: pipeline.Models, request: Request, neutrals: dict[str, np.ndar
     total = 1 + pairs.shape[1] * (pipeline.lengths(("", ""), request.frames)[0] - 1)
     points = len(models.face.landmark_index) + (len(models.face.vertices) if request.meshes else 0)
     each = total * points * 12
-    size = request.shard or max(1, SHARD_BYTES // each)
+    size = max(1, SHARD_BYTES // each) if request.shard is None else request.shard
     if size < 1 or size * each > arrays.LIMIT:
         raise ValueError(f"shard: {size} sequences of {each} bytes, expected 1 or more, up to {arrays.LIMIT} bytes")
-    firsts = list(range(0, request.count, size))
+    firsts = range(0, request.count, size)
     if len(firsts) > MOST_SHARDS:
         raise ValueError(f"shard: {size} sequences make {len(firsts)} files, expected up to {MOST_SHARDS}: take more")
     counts = [min(size, request.count - first) for first in firsts]
@@ -205,7 +205,7 @@ def _write(out: Path, number: int, made: dict[str, np.ndarray]) -> None:
 def _is_done(out: Path, number: int) -> bool:
     try:
         record = json.loads((out / "done" / f"{number:06d}.json").read_text())
-        return (out / "shards" / f"{number:06d}.npz").stat().st_size == record["bytes"]
+        return files.sha256(out / "shards" / f"{number:06d}.npz") == record["sha256"]
     except (OSError, ValueError, KeyError):
         return False
 
@@ -215,7 +215,7 @@ def _room(out: Path, plan: _Plan, shards: int) -> None:
     need, there = shards * max(plan.counts) * plan.each, shutil.disk_usage(place).free
     if need > there:
         raise ValueError(
-            f"{out}: needs {need / 1e9:.1f} GB, {there / 1e9:.1f} GB are free; name another disk with --out"
+            f"{out}: needs {need / 1e6:,.1f} MB, {there / 1e6:,.1f} MB are free; name another disk with --out"
         )
 
 

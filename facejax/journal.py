@@ -47,12 +47,16 @@ class Journal:
     def __enter__(self) -> "Journal":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+    def __exit__(self, kind: type | None, *_: object) -> None:
         if self._bar:
             self._bar.stop()
-        if self._events:
-            self._events.close()
+        try:
+            self._file.close()
+            if self._events:
+                self._events.close()
+        except OSError:
+            if kind is None:  # of a full disk, what has been raised already says more
+                raise
 
     def write(self, step: int, metrics: dict[str, float], *, seconds: float) -> None:
         """Record `metrics` of the steps up to `step`, which took `seconds`."""
@@ -103,7 +107,10 @@ def claim(folder: str | os.PathLike, what: dict[str, Any]) -> None:
     path = Path(folder) / "run.json"
     what = json.loads(json.dumps(what))
     if path.exists():
-        before = json.loads(path.read_text())
+        try:
+            before = dict(json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged ({error}): name another folder") from error
         differs = sorted(name for name in what.keys() | before.keys() if what.get(name) != before.get(name))
         if differs:
             raise ValueError(f"{folder} holds a run with another {', '.join(differs)}: name another folder")

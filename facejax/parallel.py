@@ -31,7 +31,9 @@ def everywhere(mesh: Mesh) -> NamedSharding:
 
 
 def along(mesh: Mesh, axis: int = 0) -> NamedSharding:
-    """The sharding of arrays that are split along an axis."""
+    """The sharding of arrays that are split along an axis, counted from the first."""
+    if axis < 0:
+        raise ValueError(f"axis: expected 0 or more, got {axis}")
     return NamedSharding(mesh, PartitionSpec(*(None,) * axis, AXIS))
 
 
@@ -61,9 +63,10 @@ def take(tree: Tree) -> Tree:
 
 
 def data_parallel(step: Callable, *, axis: int = 0, mesh: Mesh | None = None) -> Callable:
-    """`step`, each batch shared out among devices along an axis of its leaves; by default among all that there are.
+    """A `step(state, batch, constants)`, each batch shared out among devices along an axis of its leaves.
 
-    JAX's partitioner splits the work and sums the gradients: the step, its batch, its random numbers and so its
+    By default among all devices that there are. What comes back is to be jitted, as any `training.Step`. JAX's
+    partitioner splits the work and sums the gradients: the step, its batch, its random numbers and so its
     results, but for the order of sums, are those of one device. On a CPU it is worth it where products are too small
     for several cores: `runtime.every_core()`. Raises `ValueError` for a batch that cannot be shared out evenly.
     """
@@ -71,14 +74,23 @@ def data_parallel(step: Callable, *, axis: int = 0, mesh: Mesh | None = None) ->
     place = partial(jax.lax.with_sharding_constraint, shardings=everywhere(mesh))
 
     def stepped(state: Tree, batch: Tree, constants: Tree) -> Tree:
-        for leaf in jax.tree.leaves(batch):
-            if not -leaf.ndim <= axis < leaf.ndim or not leaf.shape[axis] or leaf.shape[axis] % mesh.size:
-                what = f"{leaf.shape[axis]}" if -leaf.ndim <= axis < leaf.ndim else f"shape {leaf.shape}"
-                raise ValueError(f"a batch of {what} cannot be shared out evenly among {mesh.size} devices")
-        batch = jax.lax.with_sharding_constraint(batch, along(mesh, axis))
+        check_shared(batch, mesh, axis)
+        batch = jax.tree.map(
+            lambda leaf: jax.lax.with_sharding_constraint(leaf, along(mesh, axis % jax.numpy.ndim(leaf))), batch
+        )
         return place(step(place(state), batch, place(constants)))
 
     return stepped
+
+
+def check_shared(batch: Tree, mesh: Mesh, axis: int) -> None:
+    """Raise `ValueError` for arrays that cannot be shared out evenly along an axis."""
+    for leaf in jax.tree.leaves(batch):
+        shape = np.shape(leaf)
+        there = -len(shape) <= axis < len(shape)
+        if not there or not shape[axis] or shape[axis] % mesh.size:
+            what = f"{shape[axis]}" if there else f"shape {shape}"
+            raise ValueError(f"a batch of {what} cannot be shared out evenly among {mesh.size} devices")
 
 
 def is_first() -> bool:

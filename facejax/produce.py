@@ -12,6 +12,8 @@ from facejax import animation, drive, files, io, pipeline, results, runtime, sca
 from facejax.data import assets, livelink, makehuman, portrait
 from facejax.io import dress, faces
 
+MOST_FRAMES = 100_000  # of all samples together
+
 
 def generate(
     neutral: np.ndarray,
@@ -41,6 +43,8 @@ def generate(
     results.check_rate(fps)
     if frames == drive.NATURAL:
         frames = pipeline.durations(models, jax.random.key(seed), labels, rate=fps)
+    if (total := samples * sum(pipeline.lengths(labels, frames))) > MOST_FRAMES:
+        raise ValueError(f"{samples} samples have {total} frames, expected up to {MOST_FRAMES}: take fewer, or --count")
     landmarks = pipeline.landmarks(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )

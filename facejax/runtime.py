@@ -6,7 +6,9 @@ The command line, the experiments and the benchmarks do; a library that is impor
 from __future__ import annotations
 
 import ctypes
+import logging
 import os
+import socket
 import sys
 
 import jax
@@ -15,12 +17,23 @@ from facejax.data import cache
 
 KEPT = (1 << 31) - 1  # bytes that stay with the process though nobody uses them
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
+_JOB = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
 def start() -> None:
-    """`compile_cache` and `keep_memory`."""
+    """`compile_cache`, `keep_memory` and `hush`."""
     compile_cache()
     keep_memory()
+    hush()
+
+
+def hush() -> None:
+    """Let libraries keep to themselves what comes as an exception anyway.
+
+    Where a checkpoint cannot be written or read, Orbax's tasks log hundreds of lines before the one that tells.
+    """
+    for name in ("asyncio", "absl"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
 def compile_cache() -> None:
@@ -62,12 +75,30 @@ def join(*, patience: int = 20) -> None:
 
     By `jax.distributed.initialize`, with what JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and
     JAX_PROCESS_ID (from 0) say; without them JAX finds the others where Slurm, Open MPI and some more have started
-    them. A process that is not heard of for `patience` seconds is lost, and ends the others. Raises `ValueError` where
-    some are set and others not, or are no numbers.
+    them. All have to come within five minutes, and JAX ends the process where one does not. One that has come and is
+    not heard of for `patience` seconds is lost, and ends the others. Raises `ValueError` where variables are missing or
+    name no host, port and numbers.
     """
-    names = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
-    told = [os.environ[name] for name in names if name in os.environ]
-    if len(told) not in (0, len(names)) or not all(number.isdigit() for number in told[1:]):
-        raise ValueError(f"expected all of {', '.join(names)}, the last two whole numbers, or none; got {told}")
+    told = [os.environ[name] for name in _JOB if name in os.environ]
+    if len(told) not in (0, len(_JOB)) or not all(number.isdigit() for number in told[1:]):
+        raise ValueError(f"expected all of {', '.join(_JOB)}, the last two whole numbers, or none; got {told}")
     job = [told[0], *map(int, told[1:])] if told else []
-    jax.distributed.initialize(*job, heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience)
+    if told:
+        _check_address(told[0])
+        print(f"waiting for {told[1]} processes at {told[0]}", file=sys.stderr, flush=True)
+    try:
+        jax.distributed.initialize(*job, heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience)
+    except ValueError as error:
+        if told:
+            raise
+        raise ValueError(f"no job to join ({error}): set {', '.join(_JOB)}") from error
+
+
+def _check_address(address: str) -> None:
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"JAX_COORDINATOR_ADDRESS: expected host:port, got {address}")
+    try:
+        socket.getaddrinfo(host.strip("[]"), int(port))
+    except OSError as error:
+        raise ValueError(f"JAX_COORDINATOR_ADDRESS: {host} is no known host ({error.strerror})") from error

@@ -124,13 +124,20 @@ def run(
         # Copied, since the first chunk would donate the caller's own arrays.
         state = saved.restored(jax.tree.map(jnp.copy, state))
         done = int(state.step)
+        if done > steps:
+            raise ValueError(
+                f"{folder} holds a run of {done} steps, more than {steps}: ask for more, or name another folder"
+            )
         if mesh is not None:
             whole, split = parallel.everywhere(mesh), parallel.along(mesh, 1)
             state, constants = parallel.put(state, whole), parallel.put(constants, whole)
 
         def prepared(first: int) -> Tree:
             data = batches(first, min(chunk - first % chunk, steps - first))
-            return data if mesh is None else parallel.put(data, split)
+            if mesh is None:
+                return data
+            parallel.check_shared(data, mesh, 1)
+            return parallel.put(data, split)
 
         saved_at, stopping = time.monotonic(), False
         with Journal(folder, done, steps, tensorboard=tensorboard) if parallel.is_first() else Silent() as journal:

@@ -1,5 +1,6 @@
 """The command line, run as a user runs it: results where they should be, one line and exit code 2 for bad input."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -349,3 +350,26 @@ def test_a_corpus_is_written_and_read(capsys, tmp_path):
 )
 def test_a_corpus_that_cannot_be_is_refused(capsys, tmp_path, arguments, message):
     assert message in refused(capsys, tmp_path / "o", "generate", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--seed", 10**20), "--seed must lie in 0..4294967295"),
+        (("--seed", -1), "--seed must lie in 0"),
+        (("--frames", 10**9), "--frames must lie in 2..10000"),
+        (("--samples", 10**9), "--count writes a corpus of many"),
+        (("--samples", 1000, "--frames", 500), "1000 samples have 500000 frames, expected up to 100000"),
+    ],
+)
+def test_numbers_that_would_fill_the_memory_are_refused(capsys, tmp_path, arguments, message):
+    assert message in refused(capsys, tmp_path / "out", "generate", "--end", "anger", *arguments)
+
+
+def test_a_write_that_fails_names_the_folder(capsys, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(io, "save", full)
+    err = refused(capsys, tmp_path / "out", "generate", "--end", "anger", "--frames", 4, "--formats", "glb")
+    assert f"{tmp_path / 'out'} cannot be written: No space left on device" in err

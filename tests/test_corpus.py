@@ -63,12 +63,16 @@ def test_what_is_missing_is_made_again_and_nothing_else(models, faces, written, 
     again = corpus.generate(models, request, faces, tmp_path / "again")
     kept = (tmp_path / "again" / again.shards[0].file).stat().st_mtime_ns
     (tmp_path / "again" / again.shards[1].file).unlink()
+    damaged = bytearray((tmp_path / "again" / again.shards[2].file).read_bytes())
+    damaged[-200] ^= 1
+    (tmp_path / "again" / again.shards[2].file).write_bytes(damaged)
     (tmp_path / "again" / "index.json").unlink()
     with pytest.raises(corpora.CorpusError, match="not finished"):
         corpora.load(tmp_path / "again")
     corpus.generate(models, request, faces, tmp_path / "again")
     assert (tmp_path / "again" / again.shards[0].file).stat().st_mtime_ns == kept
     assert [shard.sha256 for shard in corpora.load(tmp_path / "again").shards] == [s.sha256 for s in written[0].shards]
+    corpora.load(tmp_path / "again").verify()
     with pytest.raises(ValueError, match="holds a run with another seed"):
         corpus.generate(models, request._replace(seed=8), faces, tmp_path / "again")
 
@@ -82,8 +86,9 @@ def test_what_is_missing_is_made_again_and_nothing_else(models, faces, written, 
         ({"labels": ("neutral",)}, "at least a start and an end"),
         ({"frames": 1}, "whole numbers of 2 or more"),
         ({"shard": 10**9}, "shard: 1000000000 sequences"),
+        ({"shard": 0}, "shard: 0 sequences"),
         ({"count": 10**8, "shard": 1}, "make 100000000 files"),
-        ({"count": 10**8}, "GB are free"),
+        ({"count": 10**8}, "MB are free"),
     ],
 )
 def test_requests_that_cannot_be_met_are_refused(models, faces, tmp_path, change, message, monkeypatch):
@@ -116,3 +121,35 @@ def test_damage_is_named(written, tmp_path):
         (copy / "index.json").write_text(json.dumps(index))
         with pytest.raises(corpora.CorpusError, match="is no shard's name"):
             corpora.load(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"labels": None}, "labels: expected names"),
+        ({"people": [1]}, "people: expected names"),
+        ({"unit": "m"}, "expected millimetres"),
+        ({"length": None}, "a length in frames"),
+        ({"length": 7}, r"landmarks are \(5, 6, 68, 3\), expected \(n, 7, K, 3\)"),
+        ({"labels": ["neutral"]}, "labels: expected numbers below 1"),
+        ({"people": ["average"]}, "person: expected numbers below 1"),
+    ],
+)
+def test_an_index_that_its_shards_go_against_is_refused(written, change, message):
+    found, _ = written
+    place = found.path / "index.json"
+    whole = place.read_text()
+    place.write_text(json.dumps(json.loads(whole) | change))
+    try:
+        with pytest.raises(corpora.CorpusError, match=message):
+            list(corpora.load(found.path))
+    finally:
+        place.write_text(whole)
+
+
+def test_numbers_that_are_none_are_refused(written):
+    found, _ = written
+    part = found.read(0)
+    part["landmarks"] = np.where(np.arange(5)[:, None, None, None] == 1, np.nan, part["landmarks"])
+    with pytest.raises(ValueError, match="landmarks are not all finite"):
+        corpora._check(part, found.index)

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from facejax import runtime
+
 
 def printed(code, **environment):
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment or None)
@@ -40,3 +42,31 @@ print(told, faults() - before)
     if told == "False":
         pytest.skip("another C library than glibc")
     assert int(kept) < 0.1 * int(given_back)
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ({"ADDRESS": "localhost:1"}, "expected all of JAX_COORDINATOR_ADDRESS"),
+        ({"ADDRESS": "localhost:1", "NUM": "two", "ID": "0"}, "the last two whole numbers"),
+        ({"ADDRESS": "nonsense", "NUM": "2", "ID": "0"}, "expected host:port, got nonsense"),
+        ({"ADDRESS": "localhost:99999999", "NUM": "2", "ID": "0"}, "expected host:port"),
+        ({"ADDRESS": "nowhere.invalid:9000", "NUM": "2", "ID": "1"}, "nowhere.invalid is no known host"),
+    ],
+)
+def test_a_job_that_cannot_be_joined_is_refused_at_once(told, message, monkeypatch):
+    names = {"ADDRESS": "JAX_COORDINATOR_ADDRESS", "NUM": "JAX_NUM_PROCESSES", "ID": "JAX_PROCESS_ID"}
+    for name, variable in names.items():
+        monkeypatch.delenv(variable, raising=False)
+        if name in told:
+            monkeypatch.setenv(variable, told[name])
+    with pytest.raises(ValueError, match=message):
+        runtime.join()
+
+
+def test_without_a_job_there_is_nothing_to_join():
+    code = "from facejax import runtime\ntry: runtime.join()\nexcept ValueError as error: print(error)"
+    said = " ".join(printed(code))
+    assert said.startswith("no job to join") and said.endswith(
+        "set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID"
+    )

@@ -106,6 +106,22 @@ def test_entries_after_the_checkpoint_are_cut_and_a_torn_line_too(tmp_path):
     assert entries(tmp_path / "torn") == entries(tmp_path / "whole")
 
 
+def test_what_is_raised_is_not_lost_with_a_journal_that_cannot_be_closed(tmp_path):
+    """On a full disk."""
+
+    class Full:
+        def close(self):
+            raise OSError("no space left")
+
+    for inner, outer in ((RuntimeError("more"), RuntimeError), (None, OSError)):
+        record = journal.Journal(tmp_path, 0, 3)
+        record._file.close()
+        record._file = Full()
+        with pytest.raises(outer), record:
+            if inner:
+                raise inner
+
+
 def test_an_old_run_is_not_overwritten_unasked(tmp_path):
     fit(tmp_path, 4)
     with pytest.raises(ValueError, match="holds a run of 4 steps: resume it, or name another folder"):
@@ -392,6 +408,19 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
     if jax.device_count() > 1:
         with pytest.raises(ValueError, match="a batch of 7 cannot be shared out evenly among 2 devices"):
             shared(state, jax.tree.map(lambda leaf: leaf[:, :7], batch), ())
+        laid_out = []
+
+        def seen(state, batch, constants):
+            jax.debug.inspect_array_sharding(batch, callback=laid_out.append)
+            return state, {}
+
+        # An axis counted from the end is the same axis.
+        jax.jit(parallel.data_parallel(seen, axis=-2))(state, jnp.zeros((3, 8, 4)), ())
+        assert laid_out[0].shard_shape((3, 8, 4)) == (3, 8 // jax.device_count(), 4)
+    with pytest.raises(ValueError, match=r"a batch of shape \(\) cannot be shared out"):
+        parallel.data_parallel(step)(state, 0.5, ())
+    with pytest.raises(ValueError, match="axis: expected 0 or more, got -1"):
+        parallel.along(parallel.line(), -1)
 
 
 def test_several_devices_share_models_and_batches():

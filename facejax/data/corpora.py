@@ -59,6 +59,7 @@ class Corpus(NamedTuple):
             found = arrays.read_npz(path, wanted)
             if set(found) != set(wanted) or any(len(array) != shard.count for array in found.values()):
                 raise ValueError(f"expected {shard.count} of each of {', '.join(wanted)}")
+            _check(found, self.index)
         except (OSError, *arrays.DAMAGE) as error:
             raise CorpusError(f"{path}: {error}; generate it again") from error
         return found
@@ -83,13 +84,18 @@ def load(path: str | Path) -> Corpus:
         index = json.loads(place.read_bytes())
         if index["schema"] != SCHEMA:
             raise ValueError(f"schema {index['schema']}, expected {SCHEMA}")
+        for name in ("labels", "people"):
+            if not (isinstance(index[name], list) and all(isinstance(word, str) for word in index[name])):
+                raise ValueError(f"{name}: expected names, got {str(index[name])[:60]}")
+        if index["unit"] != "mm" or type(index["length"]) is not int:
+            raise ValueError(f"expected millimetres and a length in frames, got {index['unit']} and {index['length']}")
         shards = tuple(Shard(**entry) for entry in index["shards"])
         at = 0
         for shard in shards:
             if not (isinstance(shard.file, str) and _SHARD.fullmatch(shard.file)):
                 raise ValueError(f"{shard.file!r} is no shard's name")
             if shard.first != at or not shard.count > 0:
-                raise ValueError(f"{shard.file} begins at {shard.first}, expected {at}")
+                raise ValueError(f"{shard.file} has {shard.count} from {shard.first} on, expected some from {at} on")
             at += shard.count
         if at != index["request"]["count"] or not isinstance(index["request"]["meshes"], bool):
             raise ValueError(f"{at} sequences, expected {index['request']['count']}")
@@ -100,3 +106,16 @@ def load(path: str | Path) -> Corpus:
     except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         raise CorpusError(f"{place} is damaged ({error})") from error
     return Corpus(path, index, shards)
+
+
+def _check(found: dict[str, np.ndarray], index: dict[str, Any]) -> None:
+    """Raise `ValueError` where arrays go against the index."""
+    for name in ("landmarks", "vertices"):
+        if name in found and (found[name].ndim != 4 or found[name].shape[1:4:2] != (index["length"], 3)):
+            raise ValueError(f"{name} are {found[name].shape}, expected (n, {index['length']}, K, 3)")
+        if name in found and not np.isfinite(found[name]).all():
+            raise ValueError(f"{name} are not all finite")
+    for name, known in (("labels", index["labels"]), ("person", index["people"])):
+        numbers = found[name]
+        if numbers.dtype.kind not in "iu" or numbers.min() < 0 or numbers.max() >= len(known):
+            raise ValueError(f"{name}: expected numbers below {len(known)}, as many as the index names")

@@ -181,7 +181,8 @@ def readers() -> dict[str, Callable[[], Reader]]:
     def corpus_index() -> Reader:
         data = npz(landmarks=np.zeros((2, 3, 5, 3), "f4"), labels=np.zeros((2, 2), "i4"), person=np.zeros(2, "i4"))
         shard = corpora.Shard("shards/000000.npz", 0, 2, len(data), "0" * 64)._asdict()
-        index = {"schema": 1, "labels": ["neutral"], "request": {"count": 2, "meshes": False}, "shards": [shard]}
+        index = {"schema": 1, "unit": "mm", "length": 3, "labels": ["neutral"], "people": ["A"], "shards": [shard]}
+        index["request"] = {"count": 2, "meshes": False}
 
         def use(path: Path) -> object:
             found = corpora.load(path)
