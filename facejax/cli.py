@@ -5,6 +5,7 @@ Bad input ends with one line on standard error, exit code 2, and nothing written
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import webbrowser
@@ -14,6 +15,8 @@ import tyro
 
 from facejax import files
 from facejax.commands import Animate, Command, Data, Demo, Fit, Generate, Labels, Prepare, Register, View
+
+_UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -29,7 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit(130) from None
     except (ValueError, RuntimeError, OSError, MemoryError, OverflowError) as error:
         said = str(error) or type(error).__name__
-        if isinstance(error, OSError) and error.filename is None and error.strerror:  # a write, which tells no name
+        if isinstance(error, OSError) and error.errno in _UNWRITTEN and error.filename is None:  # a write tells no name
             said = f"{getattr(command, 'out', None) or 'output'} cannot be written: {error.strerror}"
         print(f"facejax: {files.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import jax
@@ -70,7 +71,8 @@ def fit(
     """Train models on a store and write them; the file, and what is off on people held out (mm, by region).
 
     Checkpoints lie beside it, in a folder of its name; called again, a stopped training goes on there. `quick`: a few
-    steps, to see that everything is in order. Several devices share each batch out.
+    steps, to see that everything is in order. Several devices share each batch out, with `distributed` those of all
+    processes of a job.
     """
     from facejax import fit_models, fit_motion, fit_residual
 
@@ -85,7 +87,10 @@ def fit(
     plans = fit_models.Plans()
     if quick:
         plans = fit_models.Plans(fit_motion.FlowPlan(steps=200), fit_residual.Plan(steps=50))
-    mesh = parallel.line() if jax.device_count() > 1 else None
+    count = jax.device_count()
+    if jax.process_count() == 1:  # no more devices than share every batch evenly
+        count = math.gcd(count, plans.motion.batch, plans.residual.batch)
+    mesh = parallel.line(jax.devices()[:count]) if count > 1 else None
     models = fit_models.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, mesh=mesh)
     errors = fit_models.judge(models, found)
     if parallel.is_first():

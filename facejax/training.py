@@ -97,8 +97,9 @@ def run(
     (every `save_steps` steps or `save_seconds` seconds, whichever comes first, at the end of a chunk; the
     newest `keep`). With `resume`, goes on from the newest checkpoint, if there is one, and cuts
     `metrics.jsonl` back to it. SIGTERM and Ctrl-C save, then leave as usual (`SystemExit`,
-    `KeyboardInterrupt`); a second one leaves at once. Raises `TrainingError` on a metric that is not finite
-    or beyond `limit`, with the step and its name, and where a checkpoint cannot be written.
+    `KeyboardInterrupt`); a second one leaves at once. Raises `ValueError` where `folder` holds
+    a longer run, and `TrainingError` on a metric that is not finite or beyond `limit`, with the step and its name, and
+    where a checkpoint cannot be written.
 
     With a `mesh` (`parallel.line`) every batch is shared out along its first axis among the devices, which may be those
     of several processes: each calls with the same arguments, the first one reads and writes `folder`, and the numbers
