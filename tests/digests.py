@@ -73,7 +73,7 @@ COMMANDS = {
     "natural": "generate --end anger --then mouth_side --frames natural --seed 11 --formats npz --out {out}",
     "person": "generate --end surprise --face {faces}/S101.ply --intensity 1.3 --formats npz --out {out}",
     "network": "animate --expression surprise --formats npz glb --out {out}",
-    "mesh": "animate --mesh {in}/scan.ply --landmarks {in}/seven.json --end anger --formats npz --out {out}",
+    "mesh": "animate --mesh {in}/head.obj --landmarks {in}/marks_cm.json --end anger --formats npz --out {out}",
     "recording": "animate --livelink {in}/take.csv --seconds 2 --person 101 --formats npz --out {out}",
     "driven": "animate --livelink {in}/take.csv --seconds 1 --mesh {in}/head.obj --landmarks {in}/marks_cm.json"
     " --kernel gaussian --sigma 2 --smoothing 0.01 --formats npz --out {out}",
