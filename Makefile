@@ -41,7 +41,7 @@ faults: setup
 	$(BIN)/python tests/faults/table.py runs/faults.jsonl
 
 browser: setup
-	$(BIN)/python -m pytest -m browser tests/io tests/test_user_study.py
+	$(BIN)/python -m pytest -m browser tests/io tests/viz tests/test_user_study.py
 
 lint: setup
 	$(BIN)/ruff check .

@@ -21,7 +21,7 @@ from typing import Any
 import tyro
 
 from benchmarks import _compare, _headline, _measure, _sizes
-from facejax import files
+from facejax.io import atomic
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results")
@@ -69,7 +69,7 @@ def main(arguments: list[str]) -> int:
     try:
         return compare(config) if comparing else everything(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"benchmarks: {files.one_line(error)}", file=sys.stderr)
+        print(f"benchmarks: {atomic.one_line(error)}", file=sys.stderr)
         return 2
 
 
@@ -141,7 +141,7 @@ def _written(documents: list[dict[str, Any]], out: Path) -> tuple[str, list[dict
         table += "\n\n" + _sizes.table(sizes)
         _sizes.plot(sizes, out / "sizes.png")
     table += "\n\n" + _made(documents) + "\n"
-    with files.replacing(out / "table.md") as temporary:
+    with atomic.replacing(out / "table.md") as temporary:
         temporary.write_text(table)
     return table, sizes
 
@@ -161,7 +161,7 @@ def _publish(config: Config, runs: list[list[dict[str, Any]]], table: str, sizes
     _measure.write(RESULTS / f"{config.name}.json", {"benchmarks": runs[-1]})
     rows = [row for document in runs[-1] for row in document["rows"]]
     for name, text in ((config.name, table), (f"{config.name}_headline", _headline.table(rows) + "\n")):
-        with files.replacing(RESULTS / f"{name}.md") as temporary:
+        with atomic.replacing(RESULTS / f"{name}.md") as temporary:
             temporary.write_text(text)
     _sizes.plot(sizes, RESULTS / f"{config.name}_sizes.png")
     if config.name == "cpu":

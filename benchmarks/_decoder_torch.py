@@ -19,8 +19,8 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks._torch import device, tensor
-from facejax.mesh.topology import Hierarchy
-from facejax.models import decoder
+from facejax.mesh.hierarchy import Hierarchy
+from facejax.models.decoders import s2d_dec
 
 WAYS = ("rows", "sparse", "sums")
 Tensors = Any
@@ -29,7 +29,7 @@ Tensors = Any
 class Peer:
     """Weights, tables and optimiser. Displacements are taken as they are: the scale of the parameters is the unit."""
 
-    def __init__(self, params: decoder.Params, hierarchy: Hierarchy, *, rate: float, weight_decay: float):
+    def __init__(self, params: s2d_dec.Params, hierarchy: Hierarchy, *, rate: float, weight_decay: float):
         self.weights = jax.tree.map(tensor, params.weights)
         self.trained = jax.tree.leaves(self.weights)
         for weight in self.trained:

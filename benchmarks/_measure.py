@@ -26,7 +26,8 @@ import jax
 import tyro
 
 from benchmarks import _machine, _roofline, _sizes, _timing
-from facejax import files, runtime
+from facejax.cli import runtime
+from facejax.io import atomic
 
 OURS = "facejax"
 Row = dict[str, Any]
@@ -97,7 +98,7 @@ def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -
         rows, sizes = run(config)
     except (ValueError, RuntimeError, OSError, AssertionError, IndexError, ZeroDivisionError) as error:
         said = f"ours and a peer's differ: {error}" if isinstance(error, AssertionError) else str(error)
-        print(f"benchmarks.{name}: {files.one_line(said)}", file=sys.stderr)
+        print(f"benchmarks.{name}: {atomic.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None
     print(table(rows))
     if sizes:
@@ -120,7 +121,7 @@ def _unwritable(path: Path) -> str | None:
 
 def write(path: Path, document: Any) -> None:
     """A JSON file, whole or not at all."""
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 

@@ -19,9 +19,9 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks._torch import tensor
-from facejax import training
-from facejax.fit_motion import FlowPlan, GanPlan
-from facejax.models import charts, flow
+from facejax.models.motion import flow_matching, tangent_pca
+from facejax.training import loop
+from facejax.training.recipes.fit_motion import FlowPlan, GanPlan
 
 Tensors = Any
 
@@ -29,7 +29,7 @@ Tensors = Any
 class Peer:
     """What both trainings share: data and chart as tensors, the optimisers' rates, the moving average."""
 
-    def __init__(self, state: training.TrainState, held: Any, plan: GanPlan | FlowPlan):
+    def __init__(self, state: loop.TrainState, held: Any, plan: GanPlan | FlowPlan):
         (values, conditions), chart = held
         self.data = [tensor(array) for array in (values, *conditions)]
         self.chart, self.plan, self.done = jax.tree.map(tensor, chart), plan, 0
@@ -44,7 +44,7 @@ class Peer:
 
     def expected(self, start, end, pose):
         """`charts.expected` of a batch."""
-        mean = F.pad(self.chart.mean[start, end], (charts.SCALARS, 0))
+        mean = F.pad(self.chart.mean[start, end], (tangent_pca.SCALARS, 0))
         return mean + torch.bmm(pose[:, None], self.chart.gain[start])[:, 0]
 
     def follow(self, trained: Tensors) -> None:
@@ -56,12 +56,12 @@ class Peer:
 class Gan(Peer):
     """`facejax.fit_motion.fit_gan`, without its optional terms."""
 
-    def __init__(self, state: training.TrainState, held: Any, plan: GanPlan):
+    def __init__(self, state: loop.TrainState, held: Any, plan: GanPlan):
         super().__init__(state, held, plan)
         self.generator, self.critic = self.weights
         self.adams = [torch.optim.Adam(jax.tree.leaves(side), betas=(0.5, 0.9), fused=True) for side in self.weights]
 
-    def draws(self, state: training.TrainState, size: int) -> list[jax.Array]:
+    def draws(self, state: loop.TrainState, size: int) -> list[jax.Array]:
         """What our step draws from its key."""
         count, width = self.plan.critic_steps, len(self.generator["skip"])
         noise, chord, play = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
@@ -103,7 +103,7 @@ class Gan(Peer):
         weights = self.generator
         hidden = torch.cat([noise, *_told(weights, start, end, pose)], 1)
         deviation = noise @ weights["skip"] + _linear(weights["head"], _stack(weights, hidden, F.silu))
-        unit = F.pad(self.chart.scale[start, end], (charts.SCALARS, 0), value=1.0)
+        unit = F.pad(self.chart.scale[start, end], (tangent_pca.SCALARS, 0), value=1.0)
         return expected + unit * deviation
 
     def _known(self, start, end, pose):
@@ -113,7 +113,7 @@ class Gan(Peer):
 
     def _score(self, values, known, expected):
         told, factor = known
-        scalars, offset = (values - expected).tensor_split([charts.SCALARS], 1)
+        scalars, offset = (values - expected).tensor_split([tangent_pca.SCALARS], 1)
         hidden = torch.cat([scalars, offset * factor, told], 1)
         activation = partial(F.leaky_relu, negative_slope=0.2)
         return _linear(self.critic["head"], _stack(self.critic, hidden, activation))[:, 0]
@@ -122,12 +122,12 @@ class Gan(Peer):
 class Flow(Peer):
     """`facejax.fit_motion.fit_flow`; states are (B, R + 1), which is the same sphere: it has a single step."""
 
-    def __init__(self, state: training.TrainState, held: Any, plan: FlowPlan):
+    def __init__(self, state: loop.TrainState, held: Any, plan: FlowPlan):
         super().__init__(state, held, plan)
         weights = jax.tree.leaves(self.weights)
         self.adams = [torch.optim.AdamW(weights, weight_decay=plan.weight_decay, fused=True)]
 
-    def draws(self, state: training.TrainState, size: int) -> list[jax.Array]:
+    def draws(self, state: loop.TrainState, size: int) -> list[jax.Array]:
         """What our step draws from its key."""
         source, time = jax.random.split(jax.random.fold_in(state.key, state.step))
         return [_normals(source, size, self.data[0].shape[1]), jax.random.uniform(time, (size,))]
@@ -142,11 +142,11 @@ class Flow(Peer):
         with torch.no_grad():
             scale = self.chart.scale[start, end]
             expected = self.expected(start, end, pose)
-            source = expected + F.pad(scale, (charts.SCALARS, 0), value=1.0) * noise
+            source = expected + F.pad(scale, (tangent_pca.SCALARS, 0), value=1.0) * noise
             y0, y1, centre = (self._wrap(x) for x in (source, values, expected))
-            rate = (values - source)[:, : charts.SCALARS]
+            rate = (values - source)[:, : tangent_pca.SCALARS]
             way = _log(y0, y1)
-            y, s = _exp(y0, time * way), source[:, : charts.SCALARS] + time * rate
+            y, s = _exp(y0, time * way), source[:, : tangent_pca.SCALARS] + time * rate
             wanted = _transport(y0, y, way)
             scale /= math.sqrt(len(self.chart.p))
             unit = torch.cat([scale.square().mean(1, keepdim=True).sqrt(), scale], 1)
@@ -159,14 +159,14 @@ class Flow(Peer):
         return {"loss": loss.detach()}
 
     def _wrap(self, values):
-        tangent = values[:, charts.SCALARS :] / math.sqrt(len(self.chart.p))
+        tangent = values[:, tangent_pca.SCALARS :] / math.sqrt(len(self.chart.p))
         pole = torch.zeros(len(values), 1 + tangent.shape[1])
         pole[:, 0] = 1
         return _exp(pole, F.pad(tangent, (1, 0)))
 
     def _velocity(self, y, s, time, told, centre, unit):
         weights = self.weights
-        angle = math.pi * time * torch.arange(flow.FREQUENCIES)
+        angle = math.pi * time * torch.arange(flow_matching.FREQUENCIES)
         context = torch.cat([angle.cos(), angle.sin(), *told], 1)
         hidden = torch.cat([torch.tanh((y - centre) / unit / 4) * 4, y * math.sqrt(unit.shape[1]), s, context], 1)
         hidden = F.silu(_linear(weights["stem"], hidden))
@@ -178,7 +178,7 @@ class Flow(Peer):
         return out - _inner(y, out) * y, rate
 
 
-def check(peer: Peer, advance: Callable, start: training.TrainState, rows: np.ndarray, held: Any) -> None:
+def check(peer: Peer, advance: Callable, start: loop.TrainState, rows: np.ndarray, held: Any) -> None:
     """A peer that does something else is none: three steps' metrics, and where weights and averages have gone."""
     state = jax.tree.map(jnp.copy, start)  # what is donated is the copy
     for step in range(3):

@@ -59,7 +59,7 @@ def plot(rows: Iterable[Row], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from facejax import files
+    from facejax.io import atomic
 
     found = curves(rows)
     axes = list(dict.fromkeys(axis for axis, _ in found))
@@ -83,6 +83,6 @@ def plot(rows: Iterable[Row], path: Path) -> None:
         panel.set(xlabel=axis, ylabel="ms")
         panel.legend(fontsize=7, title="work: exponent", title_fontsize=7)
         panel.grid(alpha=0.3)
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)

@@ -13,9 +13,10 @@ import tempfile
 from pathlib import Path
 
 from benchmarks import _machine
-from facejax import fit_decoder
-from facejax.data import makehuman, makehuman4d, meshes
-from facejax.mesh import topology
+from facejax.data import mesh_subset
+from facejax.data.synthetic import makehuman, makehuman4d
+from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.training.recipes import fit_s2d_dec
 
 CHUNK, CHUNKS = 50, 5  # of `fit_decoder.fit`
 
@@ -23,10 +24,10 @@ CHUNK, CHUNKS = 50, 5  # of `fit_decoder.fit`
 def measure() -> dict[str, float]:
     """Some chunks of steps, with batches read from disk as always."""
     data = makehuman4d.prepare()
-    everybody = meshes.of_split(data, "train", "validation", "test")
-    hierarchy = topology.build(*makehuman.template()[:2])
+    everybody = mesh_subset.of_split(data, "train", "validation", "test")
+    hierarchy = mesh_hierarchy.build(*makehuman.template()[:2])
     with tempfile.TemporaryDirectory() as folder:
-        fit_decoder.fit(everybody, hierarchy, folder, plan=fit_decoder.Plan(steps=CHUNK * CHUNKS))
+        fit_s2d_dec.fit(everybody, hierarchy, folder, plan=fit_s2d_dec.Plan(steps=CHUNK * CHUNKS))
         lines = Path(folder, "metrics.jsonl").read_text().splitlines()
     first, *steady = [json.loads(line)["seconds"] / CHUNK for line in lines]
     times = {"first_s": CHUNK * first, "min_s": min(steady), "median_s": statistics.median(steady)}

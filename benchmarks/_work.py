@@ -8,10 +8,10 @@ from typing import Any
 
 import jax
 
-from facejax import training
+from facejax.training import loop
 
 
-def scanned(step: training.Step, count: int) -> training.Step:
+def scanned(step: loop.Step, count: int) -> loop.Step:
     """So many steps on one batch in one call, as the training loop has them."""
 
     def several(state, batch, constants):
@@ -20,7 +20,7 @@ def scanned(step: training.Step, count: int) -> training.Step:
     return several
 
 
-def onward(step: training.Step, state: training.TrainState, batch: Any, constants: Any) -> Callable[[], Any]:
+def onward(step: loop.Step, state: loop.TrainState, batch: Any, constants: Any) -> Callable[[], Any]:
     """A function that goes one call on with every call, and returns the metrics."""
     advance = jax.jit(step, donate_argnums=0)
     state = jax.tree.map(jax.numpy.copy, state)  # what is donated is the copy

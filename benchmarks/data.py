@@ -21,8 +21,10 @@ import numpy as np
 import trimesh
 
 from benchmarks import _equal, _measure, _sheet
-from facejax import fit_decoder, io
-from facejax.data import makehuman4d, meshes, store
+from facejax import io
+from facejax.data import dataset, mesh_subset
+from facejax.data.synthetic import makehuman4d
+from facejax.training.recipes import fit_s2d_dec
 
 ROOT = Path(__file__).parents[1]
 
@@ -42,9 +44,9 @@ class Config(_measure.Options):
 def run(config: Config) -> _measure.Found:
     """Rows of the table."""
     rows, repeats = [], 5 if config.quick else 15
-    data = makehuman4d.prepare() if config.store is None else store.open_store(config.store)
-    everybody = meshes.of_split(data, "train")
-    read = fit_decoder.mesh_batches(everybody, config.batch, 0)
+    data = makehuman4d.prepare() if config.store is None else dataset.open_store(config.store)
+    everybody = mesh_subset.of_split(data, "train")
+    read = fit_s2d_dec.mesh_batches(everybody, config.batch, 0)
     first = iter(range(0, 10**9, 10))
     sides = {"facejax": lambda: read(next(first), 10)}
     count = 10 * config.batch

@@ -35,10 +35,11 @@ import numpy as np
 import optax
 
 from benchmarks import _equal, _measure, _sheet, _sizes, _torch, _work
-from facejax import losses, steps, training
-from facejax.mesh import topology
-from facejax.mesh.topology import Hierarchy
-from facejax.models import decoder
+from facejax import losses
+from facejax.mesh import hierarchy
+from facejax.mesh.hierarchy import Hierarchy
+from facejax.models.decoders import s2d_dec
+from facejax.training import loop, steps
 
 ROOT = Path(__file__).parents[1]
 PLAN = {"rate": 1e-3, "weight_decay": 5e-5}
@@ -64,7 +65,7 @@ class Config(_measure.Options):
 class Problem(NamedTuple):
     """A decoder and data for it."""
 
-    params: decoder.Params
+    params: s2d_dec.Params
     hierarchy: Hierarchy
     marks: jax.Array  # (B, L, 3)
     target: jax.Array  # (B, N, 3)
@@ -86,24 +87,24 @@ def run(config: Config) -> _measure.Found:
 
 def problem(side: int, batch: int) -> Problem:
     """On a sheet of side^2 vertices."""
-    host = topology.build(*_sheet.grid(side))
+    host = hierarchy.build(*_sheet.grid(side))
     rng = np.random.default_rng(0)
     marks, target, weights = (
         jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((batch, 68, 3), (batch, side**2, 3), side**2)
     )
-    return Problem(decoder.init(jax.random.key(0), host), jax.device_put(host), marks, target, jnp.abs(weights))
+    return Problem(s2d_dec.init(jax.random.key(0), host), jax.device_put(host), marks, target, jnp.abs(weights))
 
 
 def gflop(hierarchy: Hierarchy, *, batch: int, landmarks: int = 68) -> float:
     """Billions of operations of a forward pass, as the architecture states them."""
-    channels = (*decoder.CHANNELS, 3)
+    channels = (*s2d_dec.CHANNELS, 3)
     levels = [*range(len(hierarchy.spirals))][::-1] + [0]
     convs = zip((hierarchy.spirals[level].size for level in levels), channels[:-1], channels[1:], strict=True)
     products = sum(reads * inward * outward for reads, inward, outward in convs)
     return 2e-9 * batch * (3 * landmarks * hierarchy.sizes[-1] * channels[0] + products)
 
 
-def plain(params: decoder.Params, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
+def plain(params: s2d_dec.Params, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
     """`decoder.apply` as one would write it first: (B, L, 3) -> (B, N, 3)."""
     scale, weights = params
     x = ((displacements - scale.landmark_mean) / scale.landmark_std).reshape(len(displacements), -1)
@@ -126,7 +127,7 @@ def _forward(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
     params, hierarchy, marks = given[:3]
     obvious = jax.jit(plain)
     sides = {
-        "facejax": lambda: decoder.apply(params, hierarchy, marks),
+        "facejax": lambda: s2d_dec.apply(params, hierarchy, marks),
         "plain": lambda: obvious(params, hierarchy, marks),
     }
     _equal.check(sides["facejax"](), sides["plain"]())
@@ -144,7 +145,7 @@ def _gradient(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
         found = jax.jit(jax.grad(loss))
         return lambda: found(given.params.weights, *given[:4])
 
-    sides = {"facejax": slope(decoder.apply), "plain": slope(plain)}
+    sides = {"facejax": slope(s2d_dec.apply), "plain": slope(plain)}
     theirs = _peers(given, "slopes") if with_torch else {}
     for way in (sides["plain"], *theirs.values()):
         # Of its kind, each: a last kernel's slope is a hundred times one of the first.
@@ -167,12 +168,12 @@ def _step(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
     return _row("s2d_train_step", given, sides, theirs, repeats, 3, calls={"facejax": SCAN})
 
 
-def training_step(given: Problem) -> tuple[training.Step, training.TrainState]:
+def training_step(given: Problem) -> tuple[loop.Step, loop.TrainState]:
     """The step of `facejax.fit_decoder`, and where it starts."""
 
     def loss(trained, key, batch, constants):
         scale, hierarchy, weights = constants
-        predicted = decoder.apply(decoder.Params(scale, trained), hierarchy, batch[0])
+        predicted = s2d_dec.apply(s2d_dec.Params(scale, trained), hierarchy, batch[0])
         return losses.s2d(predicted, batch[1], weights), {}
 
     optimiser = optax.adamw(PLAN["rate"], weight_decay=PLAN["weight_decay"])
@@ -180,7 +181,7 @@ def training_step(given: Problem) -> tuple[training.Step, training.TrainState]:
     return steps.supervised(loss, optimiser), state
 
 
-def stepped(step: training.Step, state: training.TrainState, given: Problem) -> Callable:
+def stepped(step: loop.Step, state: loop.TrainState, given: Problem) -> Callable:
     """A function that goes on with every call."""
     constants = (given.params.scale, given.hierarchy, given.weights)
     return _work.onward(step, state, (given.marks, given.target), constants)
@@ -242,7 +243,7 @@ def _training() -> _measure.Row:
 def _by_size(config: Config) -> list[dict]:
     def sized(side: int, batch: int) -> Callable:
         given = problem(side, batch)
-        return functools.partial(decoder.apply, *given[:3])
+        return functools.partial(s2d_dec.apply, *given[:3])
 
     along_vertices = [round(math.sqrt(count)) ** 2 for count in config.vertices]
     rows = _sizes.along("s2d_forward_b1", "vertices", along_vertices, lambda count: sized(math.isqrt(count), 1))

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import _equal, _measure
-from facejax.models import dictionary, linear
+from facejax.models.decoders import dictionary, linear
 
 PASSES, BATCH = 3, 256
 L1 = 30.0  # of a code, in mm: a few atoms for each mesh

@@ -30,8 +30,10 @@ import numpy as np
 import optax
 
 from benchmarks import _equal, _measure, _sizes, _torch, _work
-from facejax import losses, parallel, runtime, steps, training
+from facejax import losses
+from facejax.cli import runtime
 from facejax.models import lstm
+from facejax.training import loop, sharding, steps
 
 RATE = 1e-3
 SCAN = 10  # steps in one call where they are scanned
@@ -126,7 +128,7 @@ def _six(config: Config, batch: int, with_torch: bool, repeats: int) -> _measure
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
     turns = steps.side_by_side(_step(), names, range(count))
 
-    def beside(step: training.Step) -> Callable:
+    def beside(step: loop.Step) -> Callable:
         state = steps.start_side_by_side(together, optax.adam(RATE), jax.random.key(0))
         return _work.onward(step, state, stacked, ((), ()))
 
@@ -235,17 +237,17 @@ def _loss(weights: lstm.Weights, key, batch: Batch, constants):
     return _error(lstm.forward(weights, batch.x), batch), {}
 
 
-def _step() -> training.Step:
+def _step() -> loop.Step:
     return steps.supervised(_loss, optax.adam(RATE))
 
 
-def _shared(batch: int) -> training.Step | None:
+def _shared(batch: int) -> loop.Step | None:
     """The step with its batch shared out among the devices; None where there is one, or where it does not go evenly."""
     count = jax.device_count()
-    return parallel.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
+    return sharding.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
 
 
-def _start(weights: lstm.Weights) -> training.TrainState:
+def _start(weights: lstm.Weights) -> loop.TrainState:
     return steps.start_supervised(weights, optax.adam(RATE), jax.random.key(0))
 
 

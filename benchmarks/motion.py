@@ -30,9 +30,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import _measure, _sizes, _torch, _transitions, _work
-from facejax import fit_motion, motion_examples, training
+from facejax.data import transitions
 from facejax.data.motions import Motions
-from facejax.models import charts, flow, generators, motion, motion_reference
+from facejax.models.motion import flow_matching, generators, motion3dgan, motion3dgan_reference, tangent_pca
+from facejax.training import loop as training_loop
+from facejax.training.recipes import fit_motion
 
 SCAN = 10  # steps in one call where they are scanned
 
@@ -43,8 +45,8 @@ class Config(_measure.Options):
 
     whole: bool = False
     """The authors' GAN at full width too."""
-    gan: motion.Config = motion.DEFAULT
-    flow: flow.Config = flow.DEFAULT
+    gan: motion3dgan.Config = motion3dgan.DEFAULT
+    flow: flow_matching.Config = flow_matching.DEFAULT
     gan_plan: fit_motion.GanPlan = dataclasses.field(default_factory=fit_motion.GanPlan)
     flow_plan: fit_motion.FlowPlan = dataclasses.field(default_factory=fit_motion.FlowPlan)
     reference_batch: int = 8
@@ -64,8 +66,8 @@ class Config(_measure.Options):
 class Run(NamedTuple):
     """A training as a fit hands it to `facejax.training.run`."""
 
-    step: training.Step
-    state: training.TrainState
+    step: training_loop.Step
+    state: training_loop.TrainState
     rows: np.ndarray  # (B,), the first batch
     held: Any  # (data, chart)
 
@@ -76,14 +78,14 @@ def run(config: Config) -> _measure.Found:
     known = _transitions.made_up(
         config.motions, labels=config.gan.labels, steps=config.gan.steps, landmarks=config.gan.landmarks
     )
-    chart = motion_examples.chart_of(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
-    examples = motion_examples.examples_of(chart, [known])
+    chart = transitions.chart_of(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
+    examples = transitions.examples_of(chart, [known])
     gan = handed(fit_motion.fit_gan, examples, chart, plan=config.gan_plan, config=config.gan)
     field = handed(fit_motion.fit_flow, examples, chart, plan=config.flow_plan, config=config.flow)
     rows = [_step("gan_step", gan, config.gan_plan, with_torch, repeats)]
     rows.append(_step("flow_step", field, config.flow_plan, with_torch, repeats))
     rows += _reference(known, chart, config)
-    pairs = {"gan": motion.Params(chart, gan.state.extra), "flow": flow.Params(chart, field.state.extra)}
+    pairs = {"gan": motion3dgan.Params(chart, gan.state.extra), "flow": flow_matching.Params(chart, field.state.extra)}
     rows += [_sampling(name, params, config, repeats) for name, params in pairs.items()]
 
     def sized(batch: int) -> Callable:
@@ -96,7 +98,7 @@ def run(config: Config) -> _measure.Found:
 
 def handed(fit: Callable, *args, **options) -> Run:
     """What a fit hands to the training loop, which is not entered: what is timed is what is trained."""
-    with mock.patch.object(training, "run") as loop, tempfile.TemporaryDirectory() as folder:
+    with mock.patch.object(training_loop, "run") as loop, tempfile.TemporaryDirectory() as folder:
         fit(*args, folder, **options)
     step, state, batches, _ = loop.call_args.args
     return Run(step, state, batches(0, 1)[0], loop.call_args.kwargs["constants"])
@@ -135,11 +137,11 @@ def _step(
     )  # fmt: skip
 
 
-def _reference(known: Motions, chart: charts.Chart, config: Config) -> list[_measure.Row]:
+def _reference(known: Motions, chart: tangent_pca.Chart, config: Config) -> list[_measure.Row]:
     """The step of the GAN as its authors built it, on few samples."""
     plan, rows = fit_motion.REFERENCE._replace(batch=config.reference_batch), []
     for divisor in (config.width_divisor, 1)[: 1 + config.whole]:
-        sizes = motion_reference.Config(width_divisor=divisor)
+        sizes = motion3dgan_reference.Config(width_divisor=divisor)
         given = handed(fit_motion.fit_reference, known, chart, plan=plan, config=sizes)
         _, memory = compiled(given)
         sides = {"facejax": _work.onward(given.step, given.state, given.rows, given.held)}

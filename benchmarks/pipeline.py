@@ -23,8 +23,8 @@ import time
 import jax
 
 from benchmarks import _measure, _sizes
-from facejax import pipeline
-from facejax.models import decoder, gpmm
+from facejax.inference import pipeline
+from facejax.models.decoders import gpmm, s2d_dec
 
 LABELS, FRAMES = ["neutral", "high_smile"], 30
 FRESH = """
@@ -50,7 +50,7 @@ class Config(_measure.Options):
 def run(config: Config) -> _measure.Found:
     """Rows of the tables."""
     models = pipeline.load()
-    spiral = models._replace(decoder=decoder.init(jax.random.key(0), models.hierarchy))
+    spiral = models._replace(decoder=s2d_dec.init(jax.random.key(0), models.hierarchy))
     ways = {"": (models, {}), "_linear": (models, {"refined": False}), "_s2d": (spiral, {})}
     rows, repeats = [], 5 if config.quick else 15
     for way, (of, options) in ways.items():

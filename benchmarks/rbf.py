@@ -23,7 +23,7 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 
 from benchmarks import _equal, _measure, _sizes
-from facejax.data import makehuman
+from facejax.data.synthetic import makehuman
 from facejax.geometry import rbf
 
 

@@ -27,9 +27,13 @@ import numpy as np
 import optax
 
 from benchmarks import _equal, _measure, _sheet, _work
-from facejax import corpus, losses, parallel, pipeline, runtime, steps, training
-from facejax.mesh import topology
-from facejax.models import decoder, lstm
+from facejax import losses
+from facejax.cli import runtime
+from facejax.inference import corpus, pipeline
+from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.models import lstm
+from facejax.models.decoders import s2d_dec
+from facejax.training import loop, sharding, steps
 
 SCAN = 5  # steps in one call
 
@@ -71,15 +75,15 @@ def run(config: Config) -> _measure.Found:
 
 def _meshes(config: Config):
     """S2D-Dec's loss, weights and a batch."""
-    host = topology.build(*_sheet.grid(config.side))
-    params, hierarchy = decoder.init(jax.random.key(0), host), jax.device_put(host)
+    host = mesh_hierarchy.build(*_sheet.grid(config.side))
+    params, hierarchy = s2d_dec.init(jax.random.key(0), host), jax.device_put(host)
     rng = np.random.default_rng(0)
     shapes = (config.meshes, 68, 3), (config.meshes, config.side**2, 3)
     batch = tuple(jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes)
 
     def loss(weights, key, batch, constants):
         scale, hierarchy = constants
-        return losses.displacement_l1(decoder.apply(decoder.Params(scale, weights), hierarchy, batch[0]), batch[1]), {}
+        return losses.displacement_l1(s2d_dec.apply(s2d_dec.Params(scale, weights), hierarchy, batch[0]), batch[1]), {}
 
     return loss, params.weights, batch, (params.scale, hierarchy)
 
@@ -99,9 +103,9 @@ def _recordings(config: Config):
 
 def _step(name: str, loss: Callable, weights, batch, constants, axis: int, repeats: int) -> _measure.Row:
     step = steps.supervised(loss, optax.adam(1e-3))
-    shared = parallel.data_parallel(step, axis=axis)
+    shared = sharding.data_parallel(step, axis=axis)
 
-    def onward(step: training.Step) -> Callable:
+    def onward(step: loop.Step) -> Callable:
         state = steps.start_supervised(weights, optax.adam(1e-3), jax.random.key(0))
         return _work.onward(step, state, batch, constants)
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import _equal, _measure, _sizes
-from facejax import runtime
+from facejax.cli import runtime
 from facejax.geometry import sphere, srvf
 
 ROOT = Path(__file__).parents[1]

@@ -8,9 +8,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from facejax.data import cache, layouts, makehuman, makehuman4d, performance, store
-from facejax.data.meshes import Meshes, of_split
-from facejax.mesh import attachment, topology
+from facejax.data import dataset
+from facejax.data.importers import registry
+from facejax.data.mesh_subset import Meshes, of_split
+from facejax.data.synthetic import makehuman, makehuman4d, performance
+from facejax.io import cache
+from facejax.mesh import hierarchy, rbf_weights
 
 MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
 FOLDS = 4
@@ -35,15 +38,15 @@ class Case(NamedTuple):
 
 def data_of(
     path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED
-) -> store.Store:
+) -> dataset.Store:
     """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
     if path is not None:
-        return store.open_meshes(path)
+        return dataset.open_meshes(path)
     size = QUICK if mode == "quick" else {}
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
 
-def check_alike(a: store.Store, b: store.Store) -> None:
+def check_alike(a: dataset.Store, b: dataset.Store) -> None:
     """Raise `ValueError` for two datasets of other triangles or landmarks."""
     for name in ("faces", "landmark_index"):
         if not np.array_equal(getattr(a, name), getattr(b, name)):
@@ -51,12 +54,12 @@ def check_alike(a: store.Store, b: store.Store) -> None:
             raise ValueError(f"{a.path} and {b.path} have other {what}: both have to be in one topology")
 
 
-def is_makehuman(data: store.Store) -> bool:
+def is_makehuman(data: dataset.Store) -> bool:
     """Whether the store holds the embedded dataset."""
     return data.index.get("name") == "makehuman4d"
 
 
-def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
+def cases(data: dataset.Store, splits: Sequence[str]) -> list[Case]:
     """The folds of each protocol.
 
     `identity`: four folds over the sorted training and validation subjects. `expression`: four over the sorted names of
@@ -85,8 +88,8 @@ def cases(data: store.Store, splits: Sequence[str]) -> list[Case]:
     return found
 
 
-def _with_people(data: store.Store) -> list[str]:
-    return [split for split in store.SPLITS if len(data.subjects(split))]
+def _with_people(data: dataset.Store) -> list[str]:
+    return [split for split in dataset.SPLITS if len(data.subjects(split))]
 
 
 def _four_folds(people: Meshes, split: str) -> list[Case]:
@@ -112,7 +115,7 @@ def _florence(people: Meshes, split: str) -> list[Case]:
     if split == "expression":
         return _one_fold(people, split, _first_of_each(people, 2))
     sex = np.array([people.data.index["subjects"][i].get("sex", "") for i in people.subjects])
-    if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, layouts.SEXES)]]:
+    if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, registry.SEXES)]]:
         raise ValueError(
             f"{people.data.path}: nothing says whether {unknown[0]} is female or male, by which Florence 4D is split: "
             "prepare it with --people"
@@ -147,21 +150,21 @@ def at_most(meshes: Meshes) -> Meshes:
     return meshes.where(np.isin(np.arange(meshes.count), keep))
 
 
-def regions_of(data: store.Store) -> dict[str, np.ndarray]:
+def regions_of(data: dataset.Store) -> dict[str, np.ndarray]:
     """The whole head, and the face: 25 mm along the surface about a landmark."""
     if is_makehuman(data):
         mask = makehuman.template().face_mask
     else:
-        mask = attachment.region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
+        mask = rbf_weights.region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
     return {"head": np.ones_like(mask), "face": mask}
 
 
-def hierarchy_of(data: store.Store) -> topology.Hierarchy:
+def hierarchy_of(data: dataset.Store) -> hierarchy.Hierarchy:
     """The levels that spiral networks climb."""
-    return topology.build(template_of(data), np.asarray(data.faces), cache=cache.folder())
+    return hierarchy.build(template_of(data), np.asarray(data.faces), cache=cache.folder())
 
 
-def template_of(data: store.Store) -> np.ndarray:
+def template_of(data: dataset.Store) -> np.ndarray:
     """The face on which tables are made: makehuman4d's own, else the mean of the training subjects."""
     if is_makehuman(data):
         return makehuman.template().vertices

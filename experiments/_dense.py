@@ -17,8 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments._cases import Case, Mode
-from facejax import evaluation, files, fit_decoder, fit_neural3dmm, fit_residual, journal, methods
-from facejax.mesh import topology
+from facejax.evaluation import baselines, vertex_error
+from facejax.io import atomic
+from facejax.mesh import hierarchy
+from facejax.training import metric_logger
+from facejax.training.recipes import fit_neural3dmm, fit_residual, fit_s2d_dec
 
 QUICK_STEPS, QUICK_COMPONENTS = 100, 60
 NAMES = {
@@ -72,19 +75,19 @@ class Options:
 class Result(NamedTuple):
     """A method on a case."""
 
-    distances: evaluation.Distances
+    distances: vertex_error.Distances
     seconds: float  # of fitting, however often it was stopped
     about: dict[str, Any]  # what was chosen
 
 
-def options_of(case: Case, mode: Mode, seed: int, hierarchy: topology.Hierarchy, **plans) -> methods.Options:
+def options_of(case: Case, mode: Mode, seed: int, hierarchy: hierarchy.Hierarchy, **plans) -> baselines.Options:
     """Steps of training by mode: a look, two hours at most for one method and split, or the paper's 300 epochs."""
-    options = methods.Options(by=case.by, seed=seed, hierarchy=hierarchy)
+    options = baselines.Options(by=case.by, seed=seed, hierarchy=hierarchy)
     if mode == "default":
         return options._replace(**plans)
     epochs = 300 * case.train.count
     steps = {
-        "decoder": fit_decoder.Plan, "residual": fit_residual.Plan, "neural3dmm": fit_neural3dmm.Plan,
+        "decoder": fit_s2d_dec.Plan, "residual": fit_residual.Plan, "neural3dmm": fit_neural3dmm.Plan,
     }  # fmt: skip
     for name, plan in steps.items():
         chosen = plan()
@@ -97,7 +100,7 @@ def judge(
     name: str,
     case: Case,
     folder: Path,
-    options: methods.Options,
+    options: baselines.Options,
     regions: dict[str, np.ndarray],
     *,
     noises: Sequence[float] = (0.0,),
@@ -129,44 +132,44 @@ def remembered(
 
 def _measured(name, case, folder, options, regions, noises) -> dict[float, Result]:
     model, seconds = _fit(name, case, folder, options)
-    method, found = methods.METHODS[name], {}
+    method, found = baselines.METHODS[name], {}
     for noise in noises:
-        distances = evaluation.distances(
+        distances = vertex_error.distances(
             lambda marks, rest: method.apply(model, marks, rest), case.test, regions, noise=noise
         )
         found[noise] = Result(distances, round(seconds, 1), _about(name, model, options))
     return found
 
 
-def fitted(name: str, case: Case, folder: Path, options: methods.Options) -> Any:
+def fitted(name: str, case: Case, folder: Path, options: baselines.Options) -> Any:
     """A method's parameters for a case: what was trained step by step in the folder of `judge` is not trained again."""
     return _fit(name, case, folder / name / case.name, options)[0]
 
 
-def _fit(name: str, case: Case, folder: Path, options: methods.Options) -> tuple[Any, float]:
+def _fit(name: str, case: Case, folder: Path, options: baselines.Options) -> tuple[Any, float]:
     """Parameters, and the seconds that they took; of networks those of their steps, however often they were stopped."""
     begun = time.perf_counter()
     if name in ("gpmm", "gpmm_found", "s2d_residual"):
         options = options._replace(base=base(case, options))
-    model = methods.METHODS[name].fit(case.train, folder, options)
-    steps = [entry["seconds"] for entry in journal.read(folder)]
+    model = baselines.METHODS[name].fit(case.train, folder, options)
+    steps = [entry["seconds"] for entry in metric_logger.read(folder)]
     return model, sum(steps) if steps else time.perf_counter() - begun
 
 
 _known_bases: dict[str, Any] = {}
 
 
-def base(case: Case, options: methods.Options):
+def base(case: Case, options: baselines.Options):
     """The morphable model of a case, which two methods share: the last one is kept, so judge one after the other."""
     facts = key("gpmm", case, options, ())
     if facts not in _known_bases:
         _known_bases.clear()
-        _known_bases[facts] = methods.METHODS["gpmm"].fit(case.train, Path(), options)
+        _known_bases[facts] = baselines.METHODS["gpmm"].fit(case.train, Path(), options)
     return _known_bases[facts]
 
 
-def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
-    if isinstance(model, methods.LinearFit):
+def _about(name: str, model: Any, options: baselines.Options) -> dict[str, Any]:
+    if isinstance(model, baselines.LinearFit):
         return {"alpha_mm2": model.alpha}
     if name in ("gpmm", "gpmm_found"):
         return model.params.prior._asdict()
@@ -175,7 +178,7 @@ def _about(name: str, model: Any, options: methods.Options) -> dict[str, Any]:
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 
-def key(name: str, case: Case, options: methods.Options, noises: Sequence[float]) -> str:
+def key(name: str, case: Case, options: baselines.Options, noises: Sequence[float]) -> str:
     """What a kept result depends on, as a hash."""
     plans = {
         "s2d": [options.decoder], "neural3dmm": [options.neural3dmm], "gpmm": [options.components],
@@ -193,7 +196,7 @@ def _write(folder: Path, key: str, found: dict[float, Result]) -> None:
               for field, value in result.distances._asdict().items()}  # fmt: skip
     first = next(iter(found.values()))
     about = json.dumps({"key": key, "seconds": first.seconds, "about": first.about})
-    with files.replacing(folder / "distances.npz") as temporary, open(temporary, "wb") as file:
+    with atomic.replacing(folder / "distances.npz") as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, about=np.array(about), **arrays)
 
 
@@ -203,18 +206,18 @@ def _read(folder: Path, key: str, noises: Sequence[float]) -> dict[float, Result
             about = json.loads(str(arrays["about"]))
             if about["key"] != key:
                 return None
-            fields = evaluation.Distances._fields
+            fields = vertex_error.Distances._fields
             found = {}
             for noise in noises:
                 parts = {field: arrays[f"{noise:g}/{field}"] for field in fields}
-                distances = evaluation.Distances(**parts | {"count": int(parts["count"])})
+                distances = vertex_error.Distances(**parts | {"count": int(parts["count"])})
                 found[noise] = Result(distances, about["seconds"], about["about"])
             return found
     except (OSError, KeyError, ValueError):
         return None
 
 
-def pooled(results: Sequence[Result]) -> evaluation.Distances:
+def pooled(results: Sequence[Result]) -> vertex_error.Distances:
     """The distances of all folds together."""
     total = results[0].distances
     for result in results[1:]:
@@ -227,7 +230,7 @@ def drawn(figure: Any, path: Path) -> Path:
     from matplotlib import pyplot
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     pyplot.close(figure)
     return path
@@ -236,5 +239,5 @@ def drawn(figure: Any, path: Path) -> Path:
 def check_methods(names: Sequence[str]) -> None:
     """Raise `ValueError` for a method that there is not."""
     for name in names:
-        if name not in methods.METHODS:
-            raise ValueError(f"unknown method {name!r}, expected some of {', '.join(methods.METHODS)}")
+        if name not in baselines.METHODS:
+            raise ValueError(f"unknown method {name!r}, expected some of {', '.join(baselines.METHODS)}")

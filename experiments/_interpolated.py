@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from facejax import augment, metrics
-from facejax.data import makehuman, motions, performance, rig, store
+from facejax.data import dataset, motions
+from facejax.data.synthetic import makehuman, performance, rig
 from facejax.geometry import sphere, srvf
 
 PATHS = ("sphere", "linear")
@@ -30,7 +31,7 @@ class Walk(NamedTuple):
     tau: np.ndarray  # (K, T): the share of the way that each frame has gone
 
 
-def joined(data: store.Store, splits: Sequence[str], only=motions.halves) -> motions.Motions:
+def joined(data: dataset.Store, splits: Sequence[str], only=motions.halves) -> motions.Motions:
     """`motions.halves` or `motions.directs` of several splits."""
     return motions.join(*(only(data, split) for split in splits))
 
@@ -70,7 +71,7 @@ def walk(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> Walk
     return Walk((1 - share) * first[:, None, -1] + share * second[:, None, -1], tau)
 
 
-def again(data: store.Store, found: motions.Motions, *, take: int = 1) -> motions.Motions:
+def again(data: dataset.Store, found: motions.Motions, *, take: int = 1) -> motions.Motions:
     """Direct transitions performed by the same people once more. They are not in the dataset: it has take 0."""
     spec = data.index["spec"]
     curves = np.zeros_like(found.curves)

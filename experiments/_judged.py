@@ -18,10 +18,12 @@ import jax
 import numpy as np
 
 from experiments import _cases
-from facejax import augment, composition, metrics, pipeline
-from facejax.data import makehuman4d, motions, store
+from facejax import augment, metrics
+from facejax.data import dataset, motions
+from facejax.data.synthetic import makehuman4d
 from facejax.geometry import sphere
-from facejax.models import generators, starts
+from facejax.inference import composition, pipeline
+from facejax.models.motion import generators, start_poses
 
 GROUPS = {"validation": 2, "test": 3}  # a split of the dataset, and the seed of the population that joins it
 FEWEST = 4  # people, and motions of a pair
@@ -79,7 +81,7 @@ def models_of(config: Options) -> list[pipeline.Models]:
     return found
 
 
-def fits(models: pipeline.Models, data: store.Store, path: Path | str) -> None:
+def fits(models: pipeline.Models, data: dataset.Store, path: Path | str) -> None:
     """Raise `ValueError` for models that were made for other labels, triangles or landmarks than the dataset's."""
     mesh = models.face
     if models.labels != data.labels:
@@ -94,14 +96,14 @@ def fits(models: pipeline.Models, data: store.Store, path: Path | str) -> None:
         )
 
 
-def data_of(config: People) -> store.Store:
+def data_of(config: People) -> dataset.Store:
     """The dataset that generators are trained on."""
     if config.data is not None:
-        return store.open_store(config.data)
+        return dataset.open_store(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
 
 
-def names_of(data: store.Store) -> tuple[Names, ...]:
+def names_of(data: dataset.Store) -> tuple[Names, ...]:
     """The pairs that are judged: OT23's 39 on makehuman4d, else all that can be made of the labels."""
     if _cases.is_makehuman(data):
         return makehuman4d.PAIRS
@@ -117,7 +119,7 @@ def halves_of(config: People, group: str) -> motions.Motions:
     if config.people and config.data is None:
         spec = makehuman4d.Spec(config.level, config.people, config.people, seed=GROUPS[group])
         others = makehuman4d.prepare(spec)
-        for split in (split for split in store.SPLITS if len(others.subjects(split))):
+        for split in (split for split in dataset.SPLITS if len(others.subjects(split))):
             part = motions.halves(others, split)
             parts.append(part._replace(subject=part.subject + config.subjects))
     return motions.join(*parts)
@@ -197,7 +199,9 @@ def norm_error(models: pipeline.Models, pairs: Sequence[Pair], *, samples: int, 
 def _norm_error(generator, beginnings, keys, start, end):
     def norm(key):
         pose_key, key = jax.random.split(key)
-        return sphere.norm(generators.sample(generator, key, start, end, starts.sample(beginnings, pose_key, start)).q)
+        return sphere.norm(
+            generators.sample(generator, key, start, end, start_poses.sample(beginnings, pose_key, start)).q
+        )
 
     return jax.numpy.max(jax.numpy.abs(jax.vmap(norm)(keys) - 1))
 

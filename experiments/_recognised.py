@@ -8,8 +8,7 @@ import numpy as np
 from sklearn.ensemble import RandomForestClassifier
 
 from experiments import _judged
-from facejax import motion_examples
-from facejax.data import motions
+from facejax.data import motions, transitions
 
 
 def forest(config: _judged.People, names: Sequence[_judged.Names], trees: int = 300) -> RandomForestClassifier:
@@ -19,7 +18,7 @@ def forest(config: _judged.People, names: Sequence[_judged.Names], trees: int = 
     """
     data = _judged.data_of(config)
     pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in names]
-    train, which = labelled(motion_examples.transitions(data, "train"), pairs)
+    train, which = labelled(transitions.transitions(data, "train"), pairs)
     found = RandomForestClassifier(trees, random_state=config.seed, n_jobs=-1)
     return found.fit(train.curves.reshape(len(which), -1), which)
 

@@ -23,7 +23,8 @@ import jax
 import numpy as np
 import tyro
 
-from facejax import files, runtime
+from facejax.cli import runtime
+from facejax.io import atomic
 
 PREPARES = "The first run prepares makehuman4d in the user's cache: some 4 minutes and 0.8 GB a level."
 RESULTS = Path(__file__).parent / "results"
@@ -41,7 +42,7 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
         _check_publish(config)
         run(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"experiments.{name}: {files.one_line(error)}", file=sys.stderr)
+        print(f"experiments.{name}: {atomic.one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from error
     print(f"results in {config.out}")
 
@@ -102,7 +103,7 @@ def finish(
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
         write_text(RESULTS / f"{name}.md", body)
         if figure is not None:
-            with files.replacing(RESULTS / f"{name}{figure.suffix}") as temporary:
+            with atomic.replacing(RESULTS / f"{name}{figure.suffix}") as temporary:
                 temporary.write_bytes(figure.read_bytes())
 
 
@@ -118,7 +119,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file as a whole or not at all."""
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         temporary.write_text(text)
 
 

@@ -8,9 +8,10 @@ import matplotlib
 import numpy as np
 
 from experiments import _run
-from facejax import animation, expressions
-from facejax.data import makehuman, store
-from facejax.io import dress, render
+from facejax.data import dataset
+from facejax.data.synthetic import makehuman
+from facejax.inference import expressions, retarget
+from facejax.viz import eyes_teeth, render
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -106,7 +107,7 @@ def plot(path: Path, judged: dict[str, dict]) -> Path:
     return path
 
 
-def sheet(path: Path, networks: expressions.Expressions, data: store.Store | None = None) -> None:
+def sheet(path: Path, networks: expressions.Expressions, data: dataset.Store | None = None) -> None:
     """Each network's own expression on one unseen face, by radial basis functions; SL21, Fig. 5.
 
     A MakeHuman face, or the last one of a dataset.
@@ -118,14 +119,14 @@ def sheet(path: Path, networks: expressions.Expressions, data: store.Store | Non
     else:
         faces, index, shown = (np.asarray(x) for x in (data.faces, data.landmark_index, data.neutral[-1]))
         rest = np.asarray(data.neutral).mean(axis=0)
-    face = animation.prepare(shown, faces, shown[index], rest[index])
-    teeth, rows = dress.Props(shape.vertices[shape.landmarks], *makehuman.template_props()), []
+    face = retarget.prepare(shown, faces, shown[index], rest[index])
+    teeth, rows = eyes_teeth.Props(shape.vertices[shape.landmarks], *makehuman.template_props()), []
     camera = render.aim(face.vertices, size=PICTURE, turn=15)
     for label in networks.labels:
         curve = np.asarray(expressions.displacements(networks, label, face.landmarks))
         chosen = curve[np.linspace(0, len(curve) - 1, FRAMES).round().astype(int)]
-        marks = np.asarray(animation.landmarks_of(face, chosen))
-        parts = dress.parts(teeth, face.landmarks, marks)
-        moved = np.asarray(animation.move(face, chosen))
+        marks = np.asarray(retarget.landmarks_of(face, chosen))
+        parts = eyes_teeth.parts(teeth, face.landmarks, marks)
+        moved = np.asarray(retarget.move(face, chosen))
         rows.append(render.frames(moved, face.faces, size=PICTURE, camera=camera, extras=parts))
     render.save(path, render.contact_sheet(rows, row_labels=list(networks.labels)))

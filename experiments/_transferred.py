@@ -9,9 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import drive
-from facejax.data import livelink, makehuman, store
+from facejax.data import dataset
+from facejax.data.synthetic import makehuman
 from facejax.geometry import srvf
+from facejax.inference import motion_sources
+from facejax.io import livelink
 
 
 class Take(NamedTuple):
@@ -26,7 +28,7 @@ class Take(NamedTuple):
 
 def posed(recording: livelink.Recording, person: makehuman.Subject, index: np.ndarray) -> Take:
     """A MakeHuman person under a recording that is evenly sampled."""
-    return of_skin(drive.posed(recording, person)[:, : len(person.vertices)], person, index)
+    return of_skin(motion_sources.posed(recording, person)[:, : len(person.vertices)], person, index)
 
 
 def of_skin(skin: np.ndarray, person: makehuman.Subject, index: np.ndarray) -> Take:
@@ -34,7 +36,7 @@ def of_skin(skin: np.ndarray, person: makehuman.Subject, index: np.ndarray) -> T
     return Take(person.name, person.vertices, (skin - person.vertices)[:, index], np.arange(len(skin)), skin)
 
 
-def stored(data: store.Store, subject: int, label: str) -> Take | None:
+def stored(data: dataset.Store, subject: int, label: str) -> Take | None:
     """A subject's first recording under a label of which there are meshes; None where there is none."""
     for sequence in data.sequences:
         if (sequence.subject, sequence.label) == (subject, label):
@@ -44,7 +46,7 @@ def stored(data: store.Store, subject: int, label: str) -> Take | None:
     return None
 
 
-def of_sequence(data: store.Store, sequence: store.Sequence) -> Take:
+def of_sequence(data: dataset.Store, sequence: dataset.Sequence) -> Take:
     """A recording of a dataset, with the meshes of it that were drawn."""
     rest = np.asarray(data.neutral[sequence.subject])
     rows = slice(sequence.start, sequence.start + sequence.frames)

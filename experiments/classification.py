@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from experiments import _judged, _recognised, _run
-from facejax import motion_examples
-from facejax.data import makehuman4d, motions
+from facejax.data import motions, transitions
+from facejax.data.synthetic import makehuman4d
 
 # OT23's Table 5, in per cent; on CoMA, with another forest and other data.
 PAPER = (
@@ -73,7 +73,7 @@ def _selected(config: Config) -> motions.Motions:
     halves = _judged.halves_of(config, "test")
     onsets = halves.take(halves.start == 0)
     count = len(_judged.data_of(config).labels)
-    chosen = motions.interpolated(onsets, count, per_pair=motion_examples.PER_PAIR, reuse=1)
+    chosen = motions.interpolated(onsets, count, per_pair=transitions.PER_PAIR, reuse=1)
     return motions.join(halves, *chosen)
 
 

@@ -23,9 +23,11 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _judged, _run
-from facejax import composition, files, io, metrics, pipeline
-from facejax.data import performance
-from facejax.io import dress, sheet
+from facejax import metrics
+from facejax.data.synthetic import performance
+from facejax.inference import composition, pipeline
+from facejax.io import atomic
+from facejax.viz import contact_sheet, eyes_teeth, render
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -87,7 +89,7 @@ def run(config: Config) -> dict[str, Any]:
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("composed", config, found, made=made, table=_table(found), figure=figure)
     if config.publish:
-        with files.replacing(_run.RESULTS / "composed_chain.png") as temporary:
+        with atomic.replacing(_run.RESULTS / "composed_chain.png") as temporary:
             temporary.write_bytes((config.out / "chain.png").read_bytes())
     return found
 
@@ -200,11 +202,11 @@ def _picture(out: Path, models: pipeline.Models, labels, seed: int) -> None:
     face = models.face
     marks = pipeline.landmarks(models, jax.random.key(seed), labels, face.vertices)
     vertices = np.asarray(pipeline.meshes(models, marks[:: FRAMES - 1], face.vertices))
-    parts = dress.parts(models.props, np.asarray(marks[0]), np.asarray(marks[:: FRAMES - 1]))
-    pictures = io.render.frames(vertices, face.faces, size=(160, 200), extras=parts)
-    pictures = sheet.caption(pictures, tuple((i, name.replace("_", " ")) for i, name in enumerate(labels)))
+    parts = eyes_teeth.parts(models.props, np.asarray(marks[0]), np.asarray(marks[:: FRAMES - 1]))
+    pictures = render.frames(vertices, face.faces, size=(160, 200), extras=parts)
+    pictures = contact_sheet.caption(pictures, tuple((i, name.replace("_", " ")) for i, name in enumerate(labels)))
     rows = [pictures[:7], pictures[7:14], pictures[14:]]
-    sheet.save(out / "chain.png", sheet.contact_sheet(rows))
+    contact_sheet.save(out / "chain.png", contact_sheet.contact_sheet(rows))
 
 
 if __name__ == "__main__":

@@ -21,11 +21,14 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _run
-from facejax import evaluation, files
-from facejax.data import makehuman, makehuman4d, performance, portrait, rig, store
-from facejax.data.meshes import of_split
-from facejax.io import render
-from facejax.models import linear
+from facejax.data import dataset
+from facejax.data.mesh_subset import of_split
+from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
+from facejax.evaluation import vertex_error
+from facejax.inference import makehuman_portrait
+from facejax.io import atomic
+from facejax.models.decoders import linear
+from facejax.viz import render
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -60,7 +63,7 @@ def run(config: Config) -> dict[str, Any]:
         if config.data is None:
             data = makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes, config.seed))
         else:
-            data = store.open_meshes(config.data)
+            data = dataset.open_meshes(config.data)
         levels[str(level)] = _counts(data) | _linear_errors(data)
         histogram = _speeds(data)
     config.out.mkdir(parents=True, exist_ok=True)
@@ -72,7 +75,7 @@ def run(config: Config) -> dict[str, Any]:
         _farthest(config.out / "expressions.png", data)
     if config.publish and config.data is None:
         for name in ("expressions", "levels"):
-            with files.replacing(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
+            with atomic.replacing(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
                 temporary.write_bytes((config.out / f"{name}.png").read_bytes())
     metrics = {"levels": levels, "speed_mm_per_s": _quantiles(histogram)}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
@@ -80,23 +83,23 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _counts(data: store.Store) -> dict[str, Any]:
+def _counts(data: dataset.Store) -> dict[str, Any]:
     direct = sum(">" in s.label for s in data.sequences)
     at, owner = data.meshes("test")
     moved = np.linalg.norm(data.vertices[at] - data.neutral[owner], axis=-1)
     mask = _cases.regions_of(data)["face"]
     return {
-        "subjects": {split: len(data.subjects(split)) for split in store.SPLITS},
+        "subjects": {split: len(data.subjects(split)) for split in dataset.SPLITS},
         "sequences": len(data.sequences) - direct,
         "direct_transitions": direct,
         "frames": len(data.landmarks),
-        "meshes": {split: len(data.meshes(split)[0]) for split in store.SPLITS},
+        "meshes": {split: len(data.meshes(split)[0]) for split in dataset.SPLITS},
         "motion_mm": {"head": float(moved.mean()), "face": float(moved[:, mask].mean())},
         "motion_peak_mm": float(moved.max()),
     }
 
 
-def _linear_errors(data: store.Store) -> dict[str, Any]:
+def _linear_errors(data: dataset.Store) -> dict[str, Any]:
     """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on a fourth of them that is unseen."""
     regions = _cases.regions_of(data)
     train, test = of_split(data, "train"), of_split(data, "test")
@@ -109,8 +112,8 @@ def _linear_errors(data: store.Store) -> dict[str, Any]:
         rows: dict[str, list] = {"ridge": [], "pca220": []}
         for fit_on, judge_on in folds:
             for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
-                params, _ = evaluation.fit_linear(model, fit_on, **options)
-                rows[name].append(evaluation.vertex_errors(lambda m, p=params: linear.apply(p, m), judge_on, regions))
+                params, _ = vertex_error.fit_linear(model, fit_on, **options)
+                rows[name].append(vertex_error.vertex_errors(lambda m, p=params: linear.apply(p, m), judge_on, regions))
         found[split] = {
             name: {region: float(np.mean([row[region]["mean_mm"] for row in of])) for region in regions}
             for name, of in rows.items()
@@ -118,7 +121,7 @@ def _linear_errors(data: store.Store) -> dict[str, Any]:
     return {"error_mm": found}
 
 
-def _speeds(data: store.Store) -> np.ndarray:
+def _speeds(data: dataset.Store) -> np.ndarray:
     """Mean speed of the landmarks in mm/s, of every frame of every expression."""
     speeds = []
     for s in data.sequences:
@@ -163,7 +166,7 @@ def _sheet(path: Path, config: Config) -> None:
     render.save(path, np.concatenate(sheets))
 
 
-def _farthest(path: Path, data: store.Store) -> None:
+def _farthest(path: Path, data: dataset.Store) -> None:
     """Of up to five people and nine labels of a dataset, the mesh that is farthest from neutral."""
     labels, at, faces = data.row_labels()[data.drawn], data.row_subjects()[data.drawn], np.asarray(data.faces)
     names, people = sorted(set(labels))[:9], np.unique(at)[:5]
@@ -194,7 +197,7 @@ def _portrait(vertices: np.ndarray) -> np.ndarray:
     """A picture of a posed head (M, 3) with its own eyes and teeth."""
     shape = makehuman.template()
     camera = render.aim(shape.vertices * 1.08, size=PICTURE, turn=18)
-    skin, parts = vertices[None, : len(shape.vertices)], portrait.parts(vertices[None])
+    skin, parts = vertices[None, : len(shape.vertices)], makehuman_portrait.parts(vertices[None])
     return render.frames(skin, shape.faces, size=PICTURE, camera=camera, extras=parts)[0]
 
 

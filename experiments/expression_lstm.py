@@ -23,10 +23,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import _cases, _run, _scored
-from facejax import evaluation, expressions, files, fit_expressions, journal, runtime
-from facejax.data import makehuman4d, performance, sequences, store
-from facejax.fit_expressions import PAPER, ExpressionPlan
-from facejax.models import sequence
+from facejax.cli import runtime
+from facejax.data import dataset, sequences
+from facejax.data.synthetic import makehuman4d, performance
+from facejax.evaluation import vertex_error
+from facejax.inference import expressions
+from facejax.io import atomic
+from facejax.models import expression_lstm
+from facejax.training import metric_logger
+from facejax.training.recipes import fit_expression_lstm
+from facejax.training.recipes.fit_expression_lstm import PAPER, ExpressionPlan
 
 PACKAGED = Path(expressions.__file__).parent / "assets" / expressions.RELEASED
 MORE = {"to choose": 2, "to judge": 3}  # seeds of populations that nothing is trained on
@@ -38,7 +44,7 @@ class Variant(NamedTuple):
     """One way of training the six networks."""
 
     plan: ExpressionPlan
-    config: sequence.Config = sequence.Config()
+    config: expression_lstm.Config = expression_lstm.Config()
     masked: bool = True
     mirror: bool = False  # everybody a second time, as in a mirror
     head: str = "none"  # "none": heads do not move; "kept" or "removed": on the dataset with head motion
@@ -46,7 +52,7 @@ class Variant(NamedTuple):
 
 STEPS = 3_000
 SHORT = PAPER._replace(steps=STEPS, final_rate=0.0)
-PLAIN = sequence.Config(carry=0.0)  # the paper's network
+PLAIN = expression_lstm.Config(carry=0.0)  # the paper's network
 SWITCH = ExpressionPlan(steps=STEPS, noise=0.0, energy=0.0)
 ENERGY = SWITCH._replace(energy=10.0)
 NOISE = SWITCH._replace(energy=20.0, noise=0.2)
@@ -62,10 +68,10 @@ VARIANTS = {
     "switch, path": Variant(SWITCH, PLAIN),
     "switch, path, energy": Variant(ENERGY, PLAIN),
     "ours": Variant(ENERGY),
-    "ours, neutral start": Variant(ENERGY, sequence.Config(start="neutral")),
+    "ours, neutral start": Variant(ENERGY, expression_lstm.Config(start="neutral")),
     "ours, noise": Variant(NOISE),
     "ours, noise, mirror": Variant(NOISE._replace(steps=4_000), mirror=True),
-    "ours, PCA-32": Variant(ENERGY, sequence.Config(components=32)),
+    "ours, PCA-32": Variant(ENERGY, expression_lstm.Config(components=32)),
     "ours, head kept": Variant(ENERGY, head="kept"),
     "ours, head removed": Variant(ENERGY, head="removed"),
 }
@@ -102,7 +108,7 @@ def run(config: Config) -> dict[str, Any]:
     begun = time.perf_counter()
     nets = {name: train(config, name) for name in config.variants}
     table = {name: scores(config, VARIANTS[name], params, CHOICE) for name, params in nets.items()}
-    seconds = {name: sum(entry["seconds"] for entry in journal.read(folder(config, name))) for name in nets}
+    seconds = {name: sum(entry["seconds"] for entry in metric_logger.read(folder(config, name))) for name in nets}
     name = chosen(table)
     variant, networks = VARIANTS[name], _networks(config, VARIANTS[name], nets[name])
     judged = scores(config, variant, nets[name], JUDGED)
@@ -114,9 +120,9 @@ def run(config: Config) -> dict[str, Any]:
         expressions.save(path, networks)
     figure = _scored.plot(config.out / "expression_lstm.png", judged)
     shown = expressions.load(config.out / expressions.RELEASED)
-    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else store.open_store(config.data))
+    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else dataset.open_store(config.data))
     if config.publish:
-        with files.replacing(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
+        with atomic.replacing(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
     text = f"Chosen: {name}.\n\n{_scored.test_table(judged)}\n\n{_scored.variants_table(table, seconds)}"
     _run.finish("expression_lstm", config, metrics, made=made, table=text, figure=figure)
@@ -139,13 +145,13 @@ def chosen(table: dict[str, dict[str, dict[str, float]]]) -> str:
     return min(within, key=lambda name: np.mean([_scored.ratios(row)["rest"] for row in table[name].values()]))
 
 
-def train(config: Config, name: str) -> sequence.Params:
+def train(config: Config, name: str) -> expression_lstm.Params:
     """The stacked networks of a variant."""
     variant = VARIANTS[name]
     data = _dataset(config, variant)
     plan = variant.plan if config.steps is None else variant.plan._replace(steps=config.steps)
     learnt_from = recordings(config, variant, "train")
-    return fit_expressions.fit(
+    return fit_expression_lstm.fit(
         sequences.join(learnt_from, sequences.mirrored(learnt_from)) if variant.mirror else learnt_from,
         folder(config, name),
         labels={label: data.labels.index(label) for label in labels_of(data)},
@@ -161,14 +167,14 @@ def recordings(config: Config, variant: Variant, split: str) -> sequences.Sequen
     if split in MORE:
         spec = _spec(config, variant)._replace(meshes=min(config.meshes, config.subjects), seed=MORE[split])
         people = makehuman4d.prepare(spec)
-        found = sequences.join(*(sequences.read(people, part, performance.EMOTIONS) for part in store.SPLITS))
+        found = sequences.join(*(sequences.read(people, part, performance.EMOTIONS) for part in dataset.SPLITS))
     else:
         data = _dataset(config, variant)
         found = sequences.read(data, split, labels_of(data))
     return sequences.without_head_motion(found) if variant.head == "removed" else found
 
 
-def labels_of(data: store.Store) -> tuple[str, ...]:
+def labels_of(data: dataset.Store) -> tuple[str, ...]:
     """What there is a network for: the six emotions, or all expressions of a dataset of the user's own."""
     return performance.EMOTIONS if _cases.is_makehuman(data) else data.labels[1:]
 
@@ -182,13 +188,15 @@ def _spec(config: Config, variant: Variant) -> makehuman4d.Spec:
     return makehuman4d.Spec(config.level, config.subjects, config.meshes, head_motion=variant.head != "none")
 
 
-def _dataset(config: Config, variant: Variant) -> store.Store:
+def _dataset(config: Config, variant: Variant) -> dataset.Store:
     if config.data is not None:
-        return store.open_store(config.data)
+        return dataset.open_store(config.data)
     return makehuman4d.prepare(_spec(config, variant))
 
 
-def scores(config: Config, variant: Variant, params: sequence.Params, splits: tuple[str, ...]) -> dict[str, dict]:
+def scores(
+    config: Config, variant: Variant, params: expression_lstm.Params, splits: tuple[str, ...]
+) -> dict[str, dict]:
     """`evaluation.expression_scores` of each emotion; all `splits` together, the first where heads move."""
     data = _dataset(config, variant)
     splits = splits if variant.head == "none" and config.data is None else splits[:1]
@@ -198,12 +206,12 @@ def scores(config: Config, variant: Variant, params: sequence.Params, splits: tu
     for i, label in enumerate(labels_of(data)):
         number = data.labels.index(label)
         parts = (held_out.take(held_out.label == number), train.take(train.label == number))
-        network, start = fit_expressions.network(params, i), variant.config.start
-        found[label] = evaluation.expression_scores(network, *parts, start=start, prefix=_scored.PREFIX)
+        network, start = fit_expression_lstm.network(params, i), variant.config.start
+        found[label] = vertex_error.expression_scores(network, *parts, start=start, prefix=_scored.PREFIX)
     return found
 
 
-def _networks(config: Config, variant: Variant, params: sequence.Params) -> expressions.Expressions:
+def _networks(config: Config, variant: Variant, params: expression_lstm.Params) -> expressions.Expressions:
     frames, data = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL, _dataset(config, variant)
     return expressions.Expressions(labels_of(data), params, variant.config, float(data.index["rate"]), frames, {})
 

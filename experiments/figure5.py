@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _dense, _run
-from facejax import evaluation
+from facejax.evaluation import vertex_error
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -65,7 +65,7 @@ def run(config: Config) -> dict[str, Any]:
             for region, share in zip(regions, shares, strict=True):
                 curves.append({"split": split, "method": name, "region": region, "share": share.round(5).tolist()})
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"])
-    metrics = {"mode": mode, "edges_mm": evaluation.EDGES.round(6).tolist(), "curves": curves}
+    metrics = {"mode": mode, "edges_mm": vertex_error.EDGES.round(6).tolist(), "curves": curves}
     figure = _plot(config.out / "figure5.png", curves, list(regions), config)
     _run.finish("figure5", config, metrics, made=made, table=_table(curves, regions, config), figure=figure)
     return metrics
@@ -83,7 +83,7 @@ def _table(curves, regions, config: Config) -> str:
         for method in config.methods:
             cells = []
             for limit in SHOWN:
-                both = [np.interp(np.log(limit), np.log(evaluation.EDGES), _share(curves, split, method, region))
+                both = [np.interp(np.log(limit), np.log(vertex_error.EDGES), _share(curves, split, method, region))
                         for region in regions]  # fmt: skip
                 cells.append(" / ".join(f"{share:.1%}" for share in both))
             body.append((_dense.NAMES[method], *cells))
@@ -102,7 +102,7 @@ def _plot(path: Path, curves, regions: list[str], config: Config) -> Path:
         for axis, region in zip(line, regions, strict=True):
             for method in config.methods:
                 style = "--" if method in ("ridge", "gpmm") else "-"
-                axis.plot(evaluation.EDGES, _share(curves, split, method, region), style, color=colours[method],
+                axis.plot(vertex_error.EDGES, _share(curves, split, method, region), style, color=colours[method],
                           label=_dense.NAMES[method])  # fmt: skip
             axis.set(xscale="log", xlim=(2e-3, 3), ylim=(0, 1), title=f"{split} split, {region}", xlabel="mm")
             axis.grid(alpha=0.3)

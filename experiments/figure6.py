@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from experiments import _cases, _dense, _run
-from facejax import methods
-from facejax.io import render
+from facejax.evaluation import baselines
+from facejax.viz import render
 
 METHODS = ("pca220", "dl3dmm", "ridge", "rbf", "neural3dmm", "s2d", "gpmm", "s2d_residual")
 SHOWN = ("high_smile", "mouth_extreme", "eyebrow", "mouth_side")  # one on each of as many people
@@ -59,7 +59,7 @@ def run(config: Config) -> dict[str, Any]:
         for row, vertices in zip(chosen, true, strict=True):
             rest = np.asarray(data.neutral[case.test.owner[row]])
             marks = case.test.read(np.array([row]))[0]
-            made = methods.METHODS[name].apply(fitted, marks, rest)[0]
+            made = baselines.METHODS[name].apply(fitted, marks, rest)[0]
             error = np.linalg.norm(made - vertices, axis=-1)
             column.append(_face(data, made, render.heat(error, high=config.high)))
             rows.append({"method": name, "label": str(case.test.labels[row]), "mean_mm": float(error.mean()),

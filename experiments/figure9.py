@@ -22,9 +22,12 @@ import jax
 import numpy as np
 
 from experiments import _judged, _run, _transferred
-from facejax import drive, io, pipeline, results
-from facejax.data import makehuman, makehuman4d, performance, rig, store
-from facejax.io import dress, render
+from facejax import io
+from facejax.cli import outputs
+from facejax.data import dataset
+from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
+from facejax.inference import motion_sources, pipeline
+from facejax.viz import eyes_teeth, render
 
 CHAINS = (
     ("neutral", "mouth_down", "mouth_side", "mouth_open", "lips_back", "neutral"),
@@ -89,10 +92,10 @@ def run(config: Config) -> dict[str, Any]:
         still = np.broadcast_to(take.rest, vertices.shape)
         mean, at_rest = (float(_transferred.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still))
         errors.append({"target": take.name, "mean_mm": mean, "still_mm": at_rest})
-    results.writable(config.out)
+    outputs.writable(config.out)
     rows = []
     for name, (take, vertices, marks) in films.items():
-        extras = dress.parts(models.props, take.rest[index], marks)
+        extras = eyes_teeth.parts(models.props, take.rest[index], marks)
         io.save(config.out / f"{name}.glb", vertices, models.face.faces, extras=extras)
         rows.append(_pictures(models, take.rest, vertices, extras))
     path = config.out / "figure9.png"
@@ -117,19 +120,19 @@ def _performed(config: Config, models: pipeline.Models) -> list[_transferred.Tak
         raise ValueError(f"--people: expected three numbers, got {config.people}")
     people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]
     if config.recording is not None:
-        take = drive.read_recording(config.recording, begin=config.begin, seconds=config.seconds)
+        take = motion_sources.read_recording(config.recording, begin=config.begin, seconds=config.seconds)
         return [_transferred.posed(take, person, index) for person in people]
     takes = [performance.perform(label, numbers[2], seed=makehuman4d.SEED).weights for label in PERFORMED]
     weights, found = np.concatenate(takes), []
     for person in people:
-        skin = rig.pose(rig.build(person, level=drive.LEVEL), weights)[:, : len(person.vertices)]
+        skin = rig.pose(rig.build(person, level=motion_sources.LEVEL), weights)[:, : len(person.vertices)]
         found.append(_transferred.of_skin(skin, person, index))
     return found
 
 
 def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_transferred.Take]]:
     """Two chains of a dataset's labels, and one label's recordings of three people."""
-    data = store.open_meshes(config.data)
+    data = dataset.open_meshes(config.data)
     _judged.fits(models, data, config.model or "the released models")
     held = np.concatenate([data.subjects(split) for split in ("test", "validation", "train")])
     numbers = list(config.people or held[:3].tolist())

@@ -24,9 +24,11 @@ import matplotlib
 import numpy as np
 
 from experiments import _judged, _recognised, _run
-from facejax import fit_motion, journal, motion_examples, pipeline
-from facejax.data import motions
-from facejax.models import flow, motion_reference
+from facejax.data import motions, transitions
+from facejax.inference import pipeline
+from facejax.models.motion import flow_matching, motion3dgan_reference
+from facejax.training import metric_logger
+from facejax.training.recipes import fit_motion
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -136,16 +138,16 @@ def chosen(table: dict[str, dict[str, Any]], real: dict[str, Any]) -> str:
     return min(inside, key=lambda name: table[name]["energy"])
 
 
-def _examples(data, source: str) -> tuple[motions.Motions, Any, motion_examples.Examples]:
+def _examples(data, source: str) -> tuple[motions.Motions, Any, transitions.Examples]:
     """Motions to fit a chart on, the chart, and all motions in it."""
     labels = len(data.labels)
     if source == "prototypes":
-        known = motion_examples.transitions(data, "train")
-        chart = motion_examples.chart_of(known, labels=labels, rank=motion_examples.rank_of(known))
-        return known, chart, motion_examples.examples_of(chart, [known])
-    known = motions.join(*motion_examples.everything(data, "train", per_pair=motion_examples.CHARTED))
-    chart = motion_examples.chart_of(known, labels=labels, rank=motion_examples.rank_of(known))
-    return known, chart, motion_examples.examples_of(chart, motion_examples.everything(data, "train"))
+        known = transitions.transitions(data, "train")
+        chart = transitions.chart_of(known, labels=labels, rank=transitions.rank_of(known))
+        return known, chart, transitions.examples_of(chart, [known])
+    known = motions.join(*transitions.everything(data, "train", per_pair=transitions.CHARTED))
+    chart = transitions.chart_of(known, labels=labels, rank=transitions.rank_of(known))
+    return known, chart, transitions.examples_of(chart, transitions.everything(data, "train"))
 
 
 def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.Models, path: Path) -> None:
@@ -155,7 +157,9 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
     # A variant that differs in what is made of a run shares the run.
     folder = weights_of(config.out, name.removesuffix(", last weights"), seed).with_suffix("")
     if kind == "gaussian":
-        generator = flow.init(jax.random.key(seed), chart, config=fit_motion.sized(flow.Config(), chart))
+        generator = flow_matching.init(
+            jax.random.key(seed), chart, config=fit_motion.sized(flow_matching.Config(), chart)
+        )
     elif kind == "flow":
         plan = fit_motion.FlowPlan(steps=config.flow_steps)
         generator = fit_motion.fit_flow(found, chart, folder, plan=plan, seed=seed)
@@ -166,12 +170,12 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
         generator = fit_motion.fit_gan(found, chart, folder, plan=plan, seed=seed, average=average)
     else:
         plan = fit_motion.REFERENCE._replace(steps=config.reference_steps, batch=config.reference_batch)
-        eighth = motion_reference.Config(width_divisor=8)
+        eighth = motion3dgan_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
-    beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train"))
+    beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
     models = lent._replace(motion=generator, starts=beginnings)
     # Of the steps alone, over all runs that it took: compiling and preparing are the same for all.
-    seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in journal.read(folder))
+    seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in metric_logger.read(folder))
     about = {"variant": name, "seed": seed, "seconds": seconds}
     pipeline.save(path, models._replace(about=models.about | about))
 
@@ -180,7 +184,7 @@ def _judge(config: Config):
     """A function from models, or None for real people, to the mean figures on validation people."""
     names = _judged.names_of(_judged.data_of(config))
     real = _judged.held(config, "validation", names)
-    train = _judged.seen(config, real.pairs, real.scale, 3 * motion_examples.CHARTED)
+    train = _judged.seen(config, real.pairs, real.scale, 3 * transitions.CHARTED)
     forest = _recognised.forest(config, names)
 
     def judge(models: pipeline.Models | None) -> dict[str, Any]:

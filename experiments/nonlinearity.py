@@ -25,9 +25,10 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _dense, _run
-from facejax import evaluation, fit_decoder, floor, methods
-from facejax.data import rig
-from facejax.models import gpmm, linear
+from facejax.data.synthetic import rig
+from facejax.evaluation import baselines, noise_floor, vertex_error
+from facejax.models.decoders import gpmm, linear
+from facejax.training.recipes import fit_s2d_dec
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -69,7 +70,7 @@ def run(config: Config) -> dict[str, Any]:
         for split in config.splits:
             case = _cases.cases(data, [split])[0]
             where = {"level": level, "noise_mm": noise, "split": split}
-            plans = {} if mode != "default" else {"decoder": fit_decoder.Plan(steps=config.steps)}
+            plans = {} if mode != "default" else {"decoder": fit_s2d_dec.Plan(steps=config.steps)}
             options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
             folder = config.folder() / f"level{level}-noise{noise:g}"
             for name in config.methods:
@@ -106,14 +107,14 @@ def _rows(where: dict[str, Any], name: str, found: dict, regions: dict[str, np.n
     return rows
 
 
-def _told_and_floor(case, options: methods.Options, regions) -> dict[float, _dense.Result]:
+def _told_and_floor(case, options: baselines.Options, regions) -> dict[float, _dense.Result]:
     """The morphable model under each landmark noise that it is told, with the two floors as what is known of it."""
     fitted = _dense.base(case, options)
-    ridge = methods.METHODS["ridge"].fit(case.train, Path(), options).params
+    ridge = baselines.METHODS["ridge"].fit(case.train, Path(), options).params
     floors, told = _floors(case, fitted.params, ridge, regions), {}
     for noise in LANDMARK_NOISE:
         params = gpmm.told(fitted.params, noise)
-        distances = evaluation.distances(
+        distances = vertex_error.distances(
             lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.on_face(p, rest), marks)),
             case.test, regions, noise=noise,
         )  # fmt: skip
@@ -132,8 +133,10 @@ def _floors(case, base: gpmm.Params, ridge: linear.Params, regions: dict[str, np
         one = gpmm.on_face(base, test.data.neutral[subject])
         with_face[mine] = vertices[mine] - np.asarray(linear.apply(one, marks[mine]))
     found = {
-        "landmarks": floor.estimate(alone, *floor.pairs(marks, test.owner)),
-        "landmarks and face": floor.estimate(with_face, *floor.pairs(marks, test.owner, apart=recording, alike=True)),
+        "landmarks": noise_floor.estimate(alone, *noise_floor.pairs(marks, test.owner)),
+        "landmarks and face": noise_floor.estimate(
+            with_face, *noise_floor.pairs(marks, test.owner, apart=recording, alike=True)
+        ),
     }
     return {
         name: {region: float(line[mask].mean()) for region, mask in regions.items()} for name, line in found.items()

@@ -22,11 +22,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments import _run
-from facejax import fit_decoder, fit_gpmm, fit_models, fit_motion, fit_residual, motion_examples, pipeline
-from facejax.data import assets, cache, makehuman, makehuman4d, motions, performance, store
-from facejax.data.meshes import of_split
-from facejax.mesh import topology
-from facejax.models import decoder, generators
+from facejax.data import dataset, motions, transitions
+from facejax.data.mesh_subset import of_split
+from facejax.data.synthetic import assets, makehuman, makehuman4d, performance
+from facejax.inference import pipeline
+from facejax.io import cache
+from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.models.decoders import s2d_dec
+from facejax.models.motion import generators
+from facejax.training.recipes import fit_bundle, fit_gpmm, fit_motion, fit_residual, fit_s2d_dec
 
 PACKAGED = Path(pipeline.__file__).parent / "assets" / pipeline.RELEASED
 
@@ -71,7 +75,7 @@ def run(config: Config) -> dict[str, Any]:
     """Train, assemble, measure."""
     data = makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
     shape = makehuman.template()
-    hierarchy = topology.build(shape.vertices, shape.faces, cache=cache.folder())
+    hierarchy = mesh_hierarchy.build(shape.vertices, shape.faces, cache=cache.folder())
     parts = {}
     if config.stage in ("all", "motion", "assemble"):
         parts["motion"] = _motion(config, data)
@@ -92,7 +96,7 @@ def run(config: Config) -> dict[str, Any]:
             assets.load().source_index[: len(shape.vertices)],
             shape.face_mask,
         ),
-        props=fit_models.props(),
+        props=fit_bundle.props(),
         motion=generator,
         starts=beginnings,
         hierarchy=hierarchy,
@@ -103,7 +107,7 @@ def run(config: Config) -> dict[str, Any]:
     pipeline.save(config.out / pipeline.RELEASED, models)
     models = pipeline.load(config.out / pipeline.RELEASED)
     metrics = {
-        "error_mm": fit_models.judge(models, data, "test"),
+        "error_mm": fit_bundle.judge(models, data, "test"),
         "seconds": {"motion": motion_seconds, "decoder": decoder_seconds},
     }
     models = models._replace(about=models.about | metrics)
@@ -112,7 +116,7 @@ def run(config: Config) -> dict[str, Any]:
         pipeline.save(PACKAGED, models)
     size = (config.out / pipeline.RELEASED).stat().st_size / 1e6
     rows = [
-        ("landmarks to mesh", "S2D-Dec" if isinstance(decode, decoder.Params) else "carried GPMM, refined"),
+        ("landmarks to mesh", "S2D-Dec" if isinstance(decode, s2d_dec.Params) else "carried GPMM, refined"),
         ("mean vertex error on test subjects, whole head", f"{metrics['error_mm']['head']:.4f} mm"),
         ("the same, face region", f"{metrics['error_mm']['face']:.4f} mm"),
         ("generator of motion", generators.kind(models.motion)),
@@ -140,8 +144,8 @@ def _taken(path: Path, network: str) -> dict[str, Any]:
     return about.get("plans", {}).get(network) or known
 
 
-def _plan(config: Config) -> fit_decoder.Plan | fit_residual.Plan:
-    plan = fit_decoder.Plan() if config.meshes_by == pipeline.S2D else fit_residual.Plan()
+def _plan(config: Config) -> fit_s2d_dec.Plan | fit_residual.Plan:
+    plan = fit_s2d_dec.Plan() if config.meshes_by == pipeline.S2D else fit_residual.Plan()
     return plan if config.decoder_steps is None else plan._replace(steps=config.decoder_steps)
 
 
@@ -151,13 +155,13 @@ def _decoder_about(config: Config) -> dict[str, Any]:
     return {"kind": config.meshes_by} | _plan(config)._asdict()
 
 
-def _names(config: Config, data: store.Store) -> tuple[str, ...]:
+def _names(config: Config, data: dataset.Store) -> tuple[str, ...]:
     if config.motion is not None:
         return pipeline.load(config.motion).labels
     return data.labels if config.labels == "all" else (performance.NEUTRAL, *performance.COMA)
 
 
-def _motion(config: Config, data: store.Store):
+def _motion(config: Config, data: dataset.Store):
     """The generator, the peaks that motions start from, and the seconds it took."""
     if config.motion is not None:
         found = pipeline.load(config.motion)
@@ -168,27 +172,27 @@ def _motion(config: Config, data: store.Store):
         if config.onsets_only:
             halves = motions.halves(data, "train", names=names)
             return [halves.take(halves.start == 0)]
-        return motion_examples.everything(data, "train", names=names, per_pair=per_pair)
+        return transitions.everything(data, "train", names=names, per_pair=per_pair)
 
     folder = config.out / "motion"
     fit = fit_motion.fit_flow if config.generator == "flow" else fit_motion.fit_gan
     with _timed(folder) as seconds:
-        known = motions.join(*parts(motion_examples.CHARTED))
-        chart = motion_examples.chart_of(known, labels=len(names))
-        examples = motion_examples.examples_of(chart, parts(motion_examples.SPREAD))
+        known = motions.join(*parts(transitions.CHARTED))
+        chart = transitions.chart_of(known, labels=len(names))
+        examples = transitions.examples_of(chart, parts(transitions.SPREAD))
         generator = fit(examples, chart, folder, plan=_motion_plan(config), seed=config.seed)
-    beginnings = motion_examples.fit_starts(chart, motions.halves(data, "train", names=names))
+    beginnings = transitions.fit_starts(chart, motions.halves(data, "train", names=names))
     return (generator, beginnings), seconds()
 
 
-def _decoder(config: Config, data: store.Store, hierarchy):
+def _decoder(config: Config, data: dataset.Store, hierarchy):
     """The way from landmarks to meshes, and the seconds it took."""
     if config.decoder is not None:
         return pipeline.load(config.decoder).decoder, 0.0
     folder, train = config.out / config.meshes_by, of_split(data, "train")
     with _timed(folder) as seconds:
         if config.meshes_by == pipeline.S2D:
-            found = fit_decoder.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed)
+            found = fit_s2d_dec.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed)
         else:
             base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
             found = fit_residual.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed, base=base)

@@ -25,11 +25,12 @@ import numpy as np
 
 from experiments import _run
 from experiments._warped import Face, Form, heat, others, regions_of, remeshed, sequence, still, weights
-from facejax.data import makehuman4d, store
-from facejax.data.meshes import of_split
+from facejax.data import dataset
+from facejax.data.mesh_subset import of_split
+from facejax.data.synthetic import makehuman4d
 from facejax.geometry import rbf
-from facejax.io import dress, render
-from facejax.mesh import ops
+from facejax.mesh import spiral_conv
+from facejax.viz import eyes_teeth, render
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -108,16 +109,16 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _data(config: Config) -> store.Store:
+def _data(config: Config) -> dataset.Store:
     if config.data is None:
         return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
-    data = store.open_meshes(config.data)
-    if len(data.landmark_index) != dress.IBUG:
-        raise ValueError(f"{data.path}: expected {dress.IBUG} landmarks, got {len(data.landmark_index)}")
+    data = dataset.open_meshes(config.data)
+    if len(data.landmark_index) != eyes_teeth.IBUG:
+        raise ValueError(f"{data.path}: expected {eyes_teeth.IBUG} landmarks, got {len(data.landmark_index)}")
     return data
 
 
-def _draw(data: store.Store, split: str, config: Config) -> list[Face]:
+def _draw(data: dataset.Store, split: str, config: Config) -> list[Face]:
     """A fixed draw of a split's meshes, by subject."""
     meshes = of_split(data, split)
     rng = np.random.default_rng(config.seed)
@@ -162,7 +163,7 @@ def _errors(faces: list[Face], form: Form | None) -> tuple[np.ndarray, np.ndarra
         warped = unmoved if form is None else np.asarray(rbf.warp(weights(form, face), face.landmarks))
         distance = distance + np.linalg.norm(warped - face.vertices, axis=-1).sum(axis=0)
         surfaces = (face.neutral + moved[::THIN] for moved in (warped, face.vertices))
-        a, b = (np.asarray(ops.vertex_normals(surface, face.faces)) for surface in surfaces)
+        a, b = (np.asarray(spiral_conv.vertex_normals(surface, face.faces)) for surface in surfaces)
         cosine = np.clip(np.sum(a * b, axis=-1), -1, 1)
         angle, thin = angle + np.degrees(np.arccos(cosine)).sum(axis=0), thin + len(cosine)
     return distance / sum(len(face.vertices) for face in faces), angle / thin
@@ -187,7 +188,7 @@ def _best(rows: list[dict[str, Any]]) -> Form:
     return Form(*(best[name] for name in Form._fields))
 
 
-def _per_frame(data: store.Store, form: Form, face: np.ndarray) -> dict[str, float]:
+def _per_frame(data: dataset.Store, form: Form, face: np.ndarray) -> dict[str, float]:
     """Bare, one system per face and the paper's one per frame, on the drawn meshes of a sequence per test subject."""
     found: dict[str, list] = {"once": [], "per_frame": [], "between_them": []}
     for i, s in enumerate(data.subjects("test")):

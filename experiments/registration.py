@@ -25,10 +25,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from experiments import _run
-from facejax import register, scanned
-from facejax.data import makehuman, makehuman4d, noise, performance, rig
-from facejax.io import render
-from facejax.mesh import nearest
+from facejax.data.synthetic import makehuman, makehuman4d, noise, performance, rig
+from facejax.inference import registration, scans
+from facejax.mesh import closest_point
+from facejax.viz import render
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -74,7 +74,7 @@ def run(config: Config) -> dict[str, Any]:
     if not 1 <= heads <= 20:
         raise ValueError(f"heads: expected 1 to 20 test people, got {heads}")
     begun, rows, shots = time.perf_counter(), [], []
-    scanned.people()
+    scans.people()
     for kind in config.kinds:
         for size in sizes:
             for marks in (68, 7):
@@ -90,7 +90,7 @@ def run(config: Config) -> dict[str, Any]:
     config.out.mkdir(parents=True, exist_ok=True)
     sheet = config.out / "registration.png"
     titles, rows_shown = zip(*shots, strict=True)
-    render.save(sheet, render.contact_sheet(rows_shown, row_labels=titles, column_labels=scanned.SHOWN))
+    render.save(sheet, render.contact_sheet(rows_shown, row_labels=titles, column_labels=scans.SHOWN))
     plot = _plot(config.out / "registration_by_size.png", rows)
     made = _run.record(config, seconds=time.perf_counter() - begun)
     metrics = {"mode": "quick" if config.quick else "default", "heads": heads, "rows": rows}
@@ -111,21 +111,21 @@ def _trial(index: int, kind: str, size: int, marks: int, seed: int) -> tuple[dic
         vertices, faces = damage(vertices, faces, rng)
         points = points + LANDMARK_NOISE / np.sqrt(3) * rng.normal(size=points.shape)
     turn, move = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 300
-    scan = scanned.Scan(
+    scan = scans.Scan(
         f"S{FIRST + index}", vertices @ turn.T + move, faces, points @ turn.T + move, which, 1.0, ()
     )  # fmt: skip
     begun = time.perf_counter()
-    found = scanned.fit(scan)
+    found = scans.fit(scan)
     seconds = time.perf_counter() - begun
     placed = (found.vertices - move) @ turn
-    true = nearest.surface(head.neutral, template.faces)
-    off = nearest.query(true, placed).distance
+    true = closest_point.surface(head.neutral, template.faces)
+    off = closest_point.query(true, placed).distance
     apart = np.linalg.norm(placed - head.neutral, axis=1)
-    hung = register.carrier(placed, template.faces, vertices, faces)
-    hits = nearest.query(true, vertices)
-    there = nearest.at(true, hits, head.moved)
-    shown = nearest.at(true, hits, template.face_mask.astype(np.float64)) > 0.5
-    lost = np.linalg.norm(register.carry(hung, head.moved) - there, axis=1)
+    hung = registration.carrier(placed, template.faces, vertices, faces)
+    hits = closest_point.query(true, vertices)
+    there = closest_point.at(true, hits, head.moved)
+    shown = closest_point.at(true, hits, template.face_mask.astype(np.float64)) > 0.5
+    lost = np.linalg.norm(registration.carry(hung, head.moved) - there, axis=1)
     face = template.face_mask
     errors = {
         "surface_mm": off[face].mean(),
@@ -136,7 +136,7 @@ def _trial(index: int, kind: str, size: int, marks: int, seed: int) -> tuple[dic
         "motion_mm": np.linalg.norm(there[shown], axis=1).mean(),
         "seconds": seconds,
     }
-    return {name: float(value) for name, value in errors.items()}, scanned.pictures(scan, found)
+    return {name: float(value) for name, value in errors.items()}, scans.pictures(scan, found)
 
 
 def _head(index: int, kind: str, seed: int) -> Head:

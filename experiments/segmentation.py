@@ -18,7 +18,8 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _run
-from facejax.data import cuts, store
+from facejax.data import dataset
+from facejax.data.importers import apex_detection
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -53,7 +54,11 @@ def run(config: Config) -> dict[str, Any]:
     data = _cases.data_of(config.data, "quick" if config.quick else "default", level=config.level)
     known = _cases.is_makehuman(data)
     takes = [take for take in data.sequences if ">" not in take.label]
-    found = [cuts.find(*_curve(data, take)) for take in takes] if known else [cuts.Cuts(*take[4:8]) for take in takes]
+    found = (
+        [apex_detection.find(*_curve(data, take)) for take in takes]
+        if known
+        else [apex_detection.Cuts(*take[4:8]) for take in takes]
+    )
     metrics: dict[str, Any] = {"recordings": len(takes), "labels": _counts(takes)}
     if known:
         metrics["errors"] = _errors(takes, found)
@@ -65,27 +70,27 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _curve(data: store.Store, take: store.Sequence) -> tuple[np.ndarray, np.ndarray]:
+def _curve(data: dataset.Store, take: dataset.Sequence) -> tuple[np.ndarray, np.ndarray]:
     """Landmarks (T, L, 3) of a recording, and those at rest (L, 3)."""
     curve = np.asarray(data.landmarks[take.start : take.start + take.frames])
     return curve, data.neutral[take.subject][data.landmark_index]
 
 
-def _csv(data: store.Store, takes, found) -> str:
+def _csv(data: dataset.Store, takes, found) -> str:
     """The cuts as `facejax data prepare --cuts` reads them."""
-    rows = ["subject,recording," + ",".join(cuts.Cuts._fields)]
+    rows = ["subject,recording," + ",".join(apex_detection.Cuts._fields)]
     for take, cut in zip(takes, found, strict=True):
         name = take.name.rpartition("/")[2] or take.label
         rows.append(f"{data.index['subjects'][take.subject]['name']},{name}," + ",".join(map(str, cut)))
     return "\n".join(rows) + "\n"
 
 
-def _counts(takes: list[store.Sequence]) -> dict[str, int]:
+def _counts(takes: list[dataset.Sequence]) -> dict[str, int]:
     labels, counts = np.unique([take.label for take in takes], return_counts=True)
     return dict(zip(labels.tolist(), counts.tolist(), strict=True))
 
 
-def _errors(takes: list[store.Sequence], found: list[cuts.Cuts]) -> list[dict[str, Any]]:
+def _errors(takes: list[dataset.Sequence], found: list[apex_detection.Cuts]) -> list[dict[str, Any]]:
     """Frames between the cuts found and the performers' own."""
     off = np.array(found) - np.array([take[4:8] for take in takes])
     return [
@@ -96,7 +101,7 @@ def _errors(takes: list[store.Sequence], found: list[cuts.Cuts]) -> list[dict[st
             "within_3": float(np.mean(np.abs(off[:, i]) <= 3)),
             "worst_frames": int(np.abs(off[:, i]).max()),
         }
-        for i, name in enumerate(cuts.Cuts._fields)
+        for i, name in enumerate(apex_detection.Cuts._fields)
     ]
 
 
@@ -114,7 +119,7 @@ def _table(metrics: dict[str, Any]) -> str:
     return f"{metrics['recordings']} recordings:\n\n{_run.markdown(header, body)}"
 
 
-def _plot(path: Path, data: store.Store, takes, found, known: bool, panels: int) -> Path:
+def _plot(path: Path, data: dataset.Store, takes, found, known: bool, panels: int) -> Path:
     chosen = np.unique(np.linspace(0, len(takes) - 1, min(panels, len(takes))).round().astype(int))
     lines = -(-len(chosen) // COLUMNS)
     figure, axes = plt.subplots(
@@ -123,7 +128,7 @@ def _plot(path: Path, data: store.Store, takes, found, known: bool, panels: int)
     for axis in axes.ravel():
         axis.set_axis_off()
     for axis, i in zip(axes.ravel(), chosen, strict=False):
-        take, moved = takes[i], cuts.energy(*_curve(data, takes[i]))
+        take, moved = takes[i], apex_detection.energy(*_curve(data, takes[i]))
         axis.set_axis_on()
         axis.plot(moved, color="0.3", lw=1)
         for (name, colour), at in zip(COLOURS.items(), found[i], strict=True):

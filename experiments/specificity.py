@@ -22,7 +22,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _judged, _run
-from facejax.data.makehuman4d import PAIRS
+from facejax.data.synthetic.makehuman4d import PAIRS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -26,9 +26,12 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _dense, _run, _transferred
-from facejax import drive, methods
-from facejax.data import livelink, makehuman, performance, store
-from facejax.data.meshes import of_split
+from facejax.data import dataset
+from facejax.data.mesh_subset import of_split
+from facejax.data.synthetic import makehuman, performance
+from facejax.evaluation import baselines
+from facejax.inference import motion_sources
+from facejax.io import livelink
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -81,7 +84,7 @@ def run(config: Config) -> dict[str, Any]:
         for source, target in pairs:
             marks = {"transferred": _transferred.onto(source, target, data.landmark_index), "own": target.landmarks}
             for what, landmarks in marks.items():
-                made = methods.METHODS[name].apply(fitted, landmarks.astype(np.float32), target.rest)
+                made = baselines.METHODS[name].apply(fitted, landmarks.astype(np.float32), target.rest)
                 for region, mask in regions.items():
                     errors[what].setdefault(region, []).append(_transferred.errors(made, target, mask, WINDOW))
         for region in regions:
@@ -99,7 +102,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_recording(config: Config, data: dataset.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every passage and person, test subjects of makehuman4d, as their own rigs move them."""
     if not _cases.is_makehuman(data):
         raise ValueError(f"--recording moves people of makehuman4d, and {config.data} has others: use --speech")
@@ -112,16 +115,16 @@ def _of_recording(config: Config, data: store.Store) -> list[tuple[_transferred.
             f"--seconds: expected at most 0.8 of the {length:.1f} s of the recording, got {config.seconds:g}"
         )
     begins = np.linspace(0.1 * length, 0.9 * length - config.seconds, config.passages)
-    takes = [drive.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
+    takes = [motion_sources.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
     faces = {i: makehuman.subject(i, seed=data.index["spec"]["seed"]) for i in (source, *others[: config.people])}
     moved = {i: [_transferred.posed(take, face, data.landmark_index) for take in takes] for i, face in faces.items()}
     first = moved.pop(source)
     return [pair for of_one in moved.values() for pair in zip(first, of_one, strict=True)]
 
 
-def _of_dataset(config: Config, data: store.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_dataset(config: Config, data: dataset.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
-    talk = store.open_meshes(config.speech)
+    talk = dataset.open_meshes(config.speech)
     _cases.check_alike(talk, data)
     people = talk.subjects("test") if len(talk.subjects("test")) > 1 else np.arange(len(talk.neutral))
     named = talk.labels[1:]

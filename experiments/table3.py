@@ -22,9 +22,9 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _dense, _run
-from facejax import evaluation
-from facejax.data import store
-from facejax.data.meshes import Meshes, of_split
+from facejax.data import dataset
+from facejax.data.mesh_subset import Meshes, of_split
+from facejax.evaluation import vertex_error
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -96,14 +96,14 @@ def run(config: Config) -> dict[str, Any]:
 def _noise_alone(noisy: Meshes, clean: Meshes, regions: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
     """How far the meshes are from the same ones without their noise."""
     pairs = ((true, made) for (_, made), (_, true) in zip(noisy, clean, strict=True))
-    return evaluation.vertex_errors(lambda moved: moved, pairs, regions)
+    return vertex_error.vertex_errors(lambda moved: moved, pairs, regions)
 
 
-def _everybody(data: store.Store) -> Meshes:
-    return of_split(data, *(split for split in store.SPLITS if len(data.subjects(split))))
+def _everybody(data: dataset.Store) -> Meshes:
+    return of_split(data, *(split for split in dataset.SPLITS if len(data.subjects(split))))
 
 
-def _training(data: store.Store) -> Meshes:
+def _training(data: dataset.Store) -> Meshes:
     known = [split for split in ("train", "validation") if len(data.subjects(split))]
     return _cases.at_most(of_split(data, *known))
 

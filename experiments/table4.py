@@ -23,7 +23,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _dense, _run
-from facejax import fit_decoder
+from facejax.training.recipes import fit_s2d_dec
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -63,7 +63,7 @@ def run(config: Config) -> dict[str, Any]:
     for name, changes in VARIANTS.items():
         begun = time.perf_counter()
         options = _dense.options_of(case, mode, config.seed, hierarchy)
-        plan = options.decoder if mode != "default" else fit_decoder.Plan(steps=config.steps)
+        plan = options.decoder if mode != "default" else fit_s2d_dec.Plan(steps=config.steps)
         options = options._replace(decoder=plan._replace(**changes))
         folder = config.folder() / name.replace(", ", "-").lower()
         result = _dense.judge("s2d", case, folder, options, regions)[0.0]

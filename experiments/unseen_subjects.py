@@ -20,10 +20,13 @@ import matplotlib
 import numpy as np
 
 from experiments import _cases, _run
-from facejax import evaluation, fit_decoder, journal
-from facejax.data import makehuman4d, rig, store
-from facejax.data.meshes import Meshes, of_split
-from facejax.models import decoder, linear
+from facejax.data import dataset
+from facejax.data.mesh_subset import Meshes, of_split
+from facejax.data.synthetic import makehuman4d, rig
+from facejax.evaluation import vertex_error
+from facejax.models.decoders import linear, s2d_dec
+from facejax.training import metric_logger
+from facejax.training.recipes import fit_s2d_dec
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -45,7 +48,7 @@ class Config:
     """Of the dataset."""
     meshes: int = 20_000
     """Of the dataset."""
-    steps: int = fit_decoder.Plan().steps
+    steps: int = fit_s2d_dec.Plan().steps
     """Of S2D-Dec."""
     publish: bool = False
     """Also write the figures that the README quotes."""
@@ -62,11 +65,11 @@ def run(config: Config) -> dict[str, Any]:
         train, test = of_split(data, "train"), of_split(data, "test")
         regions = _cases.regions_of(data)
         for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
-            params, alpha = evaluation.fit_linear(model, train, **options)
-            found = evaluation.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
+            params, alpha = vertex_error.fit_linear(model, train, **options)
+            found = vertex_error.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
             rows += _rows(level, name, found, {"alpha_mm2": alpha})
         decode, training = _decoder(config, level, train)
-        rows += _rows(level, "s2d", evaluation.vertex_errors(decode, test, regions), training)
+        rows += _rows(level, "s2d", vertex_error.vertex_errors(decode, test, regions), training)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     metrics = {"rows": rows}
     figure = _plot(config.out / "unseen_subjects.png", rows, levels)
@@ -74,9 +77,9 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _data(config: Config, level: int | str) -> store.Store:
+def _data(config: Config, level: int | str) -> dataset.Store:
     if config.data is not None:
-        return store.open_meshes(config.data)
+        return dataset.open_meshes(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
 
 
@@ -86,11 +89,11 @@ def _named(level: int | str) -> str:
 
 def _decoder(config: Config, level: int | str, train: Meshes):
     hierarchy = jax.device_put(_cases.hierarchy_of(train.data))
-    folder, plan = config.out / _named(level).replace(" ", ""), fit_decoder.Plan(steps=config.steps)
-    params = fit_decoder.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
-    seconds = sum(entry["seconds"] for entry in journal.read(folder))
+    folder, plan = config.out / _named(level).replace(" ", ""), fit_s2d_dec.Plan(steps=config.steps)
+    params = fit_s2d_dec.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
+    seconds = sum(entry["seconds"] for entry in metric_logger.read(folder))
     about = {"steps": plan.steps, "train_seconds": round(seconds, 1)}
-    return (lambda marks: decoder.apply(params, hierarchy, marks)), about
+    return (lambda marks: s2d_dec.apply(params, hierarchy, marks)), about
 
 
 def _rows(level: int | str, method: str, found: dict[str, Any], more: dict[str, Any]) -> list[dict[str, Any]]:

@@ -28,10 +28,11 @@ import jax
 import numpy as np
 
 from experiments import _run, _study
-from facejax import pipeline, results
-from facejax.data import makehuman, makehuman4d, performance, rig
+from facejax.cli import outputs
+from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
 from facejax.geometry import align
-from facejax.io import dress, film, render
+from facejax.inference import pipeline
+from facejax.viz import eyes_teeth, render, video
 
 FACES, EXAMPLE_FACE = range(100, 119), 119  # test subjects of the dataset: no network has seen them
 EXAMPLE = ("neutral", "high_smile", "neutral")
@@ -110,7 +111,7 @@ def _show(config: Config) -> dict[str, Any]:
     items = plan(config, models)
     example = Item("example", EXAMPLE, EXAMPLE_FACE, len(items))
     films, listed = [], {}
-    with results.progress("user study", len(items) + 2) as advance:
+    with outputs.progress("user study", len(items) + 2) as advance:
         for item in items:
             films.append(_filmed(config, models["ours"], item, _moved(config, models, item)))
             listed[films[-1].name] = {"kind": item.kind, "labels": item.labels, "subject": f"S{item.subject:03d}"}
@@ -219,14 +220,14 @@ def _filmed(config: Config, models: pipeline.Models, item: Item, motion: Motion)
     size = (config.width, config.width * 5 // 4)
     pictures = render.frames(
         motion.vertices, models.face.faces, size=size, camera=render.aim(motion.vertices, size=size, turn=TURN),
-        extras=dress.parts(models.props, rest, motion.landmarks),
+        extras=eyes_teeth.parts(models.props, rest, motion.landmarks),
     )  # fmt: skip
     texts = [f"{a} → {b}".replace("_", " ") for a, b in itertools.pairwise(item.labels)]
     pictures = render.caption(pictures, tuple(zip(motion.starts, texts, strict=True)))
     pictures = np.concatenate([pictures[[0] * LEAD], pictures, pictures[[-1] * REST]])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "film.webp"
-        film.write(path, pictures, fps=pipeline.RATE, quality=QUALITY)
+        video.write(path, pictures, fps=pipeline.RATE, quality=QUALITY)
         data = path.read_bytes()
     # The kind belongs to the name: two generators might make the same picture.
     name = hashlib.sha256(json.dumps(item).encode() + data).hexdigest()[:12]

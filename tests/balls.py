@@ -3,8 +3,8 @@
 import numpy as np
 import trimesh
 
-from facejax.data import store
-from facejax.mesh import transfer
+from facejax.data import dataset
+from facejax.mesh import deformation_transfer
 
 
 def store_of_balls():
@@ -32,13 +32,13 @@ def store_of_balls():
     for subject in range(len(splits)):
         stretch = np.eye(3) + 0.15 * rng.normal(size=(3, 3))
         neutral.append(vertices @ stretch.T + 3 * bump(int(rng.integers(162)), 30.0)[:, None] * rng.normal(size=3))
-        carrier = transfer.Carrier(vertices, neutral[-1], faces, np.full(len(vertices), 2.0))
+        carrier = deformation_transfer.Carrier(vertices, neutral[-1], faces, np.full(len(vertices), 2.0))
         for label, first, second in zip(labels, mixed, curved, strict=True):
             own = rng.uniform(0.5, 1.5) * strength
             moved.append(neutral[-1] + carrier(own * first + own**2 * second))
-            sequences.append(store.Sequence(subject, label, start, frames, 0, 4, 5, 8, 1.0))
+            sequences.append(dataset.Sequence(subject, label, start, frames, 0, 4, 5, 8, 1.0))
             start += frames
     neutral, moved = np.asarray(neutral, np.float32), np.concatenate(moved).astype(np.float32)
     drawn = np.sort(rng.permutation(start)[: 2 * start // 3])
     index = {"spec": {"name": "balls"}, "labels": labels, "subjects": [{"split": split} for split in splits]}
-    return store.Store(None, index, tuple(sequences), faces, neutral, moved[:, marks], moved[drawn], drawn, marks)
+    return dataset.Store(None, index, tuple(sequences), faces, neutral, moved[:, marks], moved[drawn], drawn, marks)

@@ -34,10 +34,12 @@ from benchmarks import (
     scale,
     srvf,
 )
-from facejax import fit_motion, motion_examples, training
-from facejax.models import decoder as s2d
-from facejax.models import flow
-from facejax.models import motion as gan
+from facejax.data import transitions
+from facejax.models.decoders import s2d_dec as s2d
+from facejax.models.motion import flow_matching
+from facejax.models.motion import motion3dgan as gan
+from facejax.training import loop
+from facejax.training.recipes import fit_motion
 
 
 @pytest.fixture(autouse=True)
@@ -416,7 +418,7 @@ def test_data(tiny_store, monkeypatch):
 TINY = motion.Config(
     quick=True,
     gan=gan.Config(steps=5, landmarks=4, labels=3, noise=6, rank=8, pose=3, width=8, blocks=1, embedding=2),
-    flow=flow.Config(width=8, blocks=1, embedding=2),
+    flow=flow_matching.Config(width=8, blocks=1, embedding=2),
     gan_plan=fit_motion.GanPlan(steps=20, batch=6, critic_steps=2),
     flow_plan=fit_motion.FlowPlan(steps=20, batch=6),
     reference_batch=1,
@@ -432,7 +434,7 @@ handed = motion.handed
 def idle(fit, *args, **options):
     """What a fit hands over, but for its step: to compile those takes most of the time."""
     if fit is fit_motion.fit_reference:  # whose networks are large at any size
-        state = training.TrainState(jnp.int32(0), (), (), jax.random.key(0))
+        state = loop.TrainState(jnp.int32(0), (), (), jax.random.key(0))
         run = motion.Run(None, state, jnp.arange(2), ())
     else:
         run = handed(fit, *args, **options)
@@ -455,10 +457,10 @@ def test_motion_peer_takes_the_same_steps(name, fit, monkeypatch):
 
     sizes = {field: getattr(TINY.gan, field) for field in ("labels", "steps", "landmarks")}
     known = _transitions.made_up(TINY.motions, **sizes)
-    chart = motion_examples.chart_of(known, labels=3, rank=8, pose=3)
+    chart = transitions.chart_of(known, labels=3, rank=8, pose=3)
     kind = name.lower()
     plan, config = getattr(TINY, f"{kind}_plan"), getattr(TINY, kind)
-    run = motion.handed(fit, motion_examples.examples_of(chart, [known]), chart, plan=plan, config=config)
+    run = motion.handed(fit, transitions.examples_of(chart, [known]), chart, plan=plan, config=config)
     program, _ = motion.compiled(run)
     peer = getattr(_motion_torch, name)
     _motion_torch.check(peer(run.state, run.held, plan), program, run.state, run.rows, run.held)

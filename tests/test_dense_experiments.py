@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from experiments import _cases, _dense, _run, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
-from facejax import evaluation, fit_gpmm, methods
-from facejax.data import makehuman4d, store
-from facejax.data.meshes import of_split
-from tests.test_cli import recorded
+from facejax.data import dataset
+from facejax.data.mesh_subset import of_split
+from facejax.data.synthetic import makehuman4d
+from facejax.evaluation import baselines, vertex_error
+from facejax.training.recipes import fit_gpmm
+from tests.cli.test_main import recorded
 from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
 
 
@@ -43,7 +45,7 @@ def test_table1_has_a_row_for_each_and_goes_on(tiny, tmp_path, monkeypatch):
     assert all(r["mean_mm"] > 0 and r["std_mm"] > 0 for r in rows)
     assert all(len(r["folds_mm"]) == (2 if r["split"] == "identity" else 1) for r in rows)
     # Known results are read, not made again.
-    monkeypatch.setattr(methods, "METHODS", dict.fromkeys(methods.METHODS))
+    monkeypatch.setattr(baselines, "METHODS", dict.fromkeys(baselines.METHODS))
     table1.run(config)
     assert json.loads((tmp_path / "o" / "metrics.json").read_text())["rows"] == rows
     # The curves are of the same results.
@@ -63,7 +65,7 @@ def test_table1_on_a_store_of_ones_own(tiny, tiny_store, tmp_path):
 
 def test_a_result_is_made_anew_when_what_it_depends_on_changes(tiny, tiny_store, tmp_path, monkeypatch):
     case = _cases.cases(tiny_store, ["identity"])[0]
-    regions, options = _cases.regions_of(tiny_store), methods.Options()
+    regions, options = _cases.regions_of(tiny_store), baselines.Options()
     first = _dense.judge("still", case, tmp_path, options, regions)[0.0]
     again = _dense.judge("still", case, tmp_path, options, regions)[0.0]
     np.testing.assert_array_equal(first.distances.total, again.distances.total)
@@ -101,7 +103,7 @@ def test_published_splits(tiny_store, name, identity, expression):
         [f"e{i:02}" for i in range(14)] + ["angry", "disgust"] if name == "bu3dfe" else [f"e{i:02}" for i in range(14)]
     )
     count = {"d3dfacs": 10, "bu3dfe": 20, "florence4d": 60, "coma": 12}[name]
-    recordings = [store.Sequence(p, label, 0, 1, 0, 0, 0, 0, 0.1) for p in range(count) for label in labels]
+    recordings = [dataset.Sequence(p, label, 0, 1, 0, 0, 0, 0, 0.1) for p in range(count) for label in labels]
     # Whom the dataset's own splits keep apart is among the paper's people all the same.
     splits = [makehuman4d.split_of(i, count) for i in range(count)]
     people = [
@@ -254,8 +256,8 @@ def test_modes_exclude_each_other():
 
 def test_distances_add_up(tiny_store):
     meshes = of_split(tiny_store, "train")
-    parts = [evaluation.distances(_still, meshes.where(meshes.owner == s), _all(meshes)) for s in meshes.subjects]
-    whole = evaluation.distances(_still, meshes, _all(meshes))
+    parts = [vertex_error.distances(_still, meshes.where(meshes.owner == s), _all(meshes)) for s in meshes.subjects]
+    whole = vertex_error.distances(_still, meshes, _all(meshes))
     total = parts[0]
     for part in parts[1:]:
         total = total.add(part)

@@ -20,8 +20,12 @@ from experiments import (
     specificity,
     unseen_subjects,
 )
-from facejax import augment, evaluation, expressions, fit_gpmm, motion_examples
-from facejax.data import makehuman4d, motions
+from facejax import augment
+from facejax.data import motions, transitions
+from facejax.data.synthetic import makehuman4d
+from facejax.evaluation import vertex_error
+from facejax.inference import expressions
+from facejax.training.recipes import fit_gpmm
 
 TINY = {"subjects": 6, "meshes": 260}
 
@@ -29,12 +33,12 @@ TINY = {"subjects": 6, "meshes": 260}
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """Tiny datasets must not land in the user's cache; the assets are already loaded."""
-    from facejax.data import assets
+    from facejax.data.synthetic import assets
 
     assets.load()
     # The choice of the linear maps' one weight is what takes the time; two candidates show that it works.
-    monkeypatch.setattr(evaluation, "ALPHAS", (1e-6, 1e-2))
-    monkeypatch.setattr(evaluation, "FOLDS", 2)
+    monkeypatch.setattr(vertex_error, "ALPHAS", (1e-6, 1e-2))
+    monkeypatch.setattr(vertex_error, "FOLDS", 2)
     monkeypatch.setenv("FACEJAX_CACHE", str(tmp_path / "cache"))
 
 
@@ -65,8 +69,8 @@ def test_unseen_subjects(own_cache, tmp_path):
 
 
 def test_pretrain(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(motion_examples, "SPREAD", 2)
-    monkeypatch.setattr(motion_examples, "CHARTED", 2)
+    monkeypatch.setattr(transitions, "SPREAD", 2)
+    monkeypatch.setattr(transitions, "CHARTED", 2)
     monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
     monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.12,))
     monkeypatch.setattr(fit_gpmm, "NOISE", (1e-2,))
@@ -116,8 +120,8 @@ PEOPLE = {"level": 1, "people": 6, **TINY}
 
 
 def test_generators(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(motion_examples, "SPREAD", 2)
-    monkeypatch.setattr(motion_examples, "CHARTED", 2)
+    monkeypatch.setattr(transitions, "SPREAD", 2)
+    monkeypatch.setattr(transitions, "CHARTED", 2)
     config = generators.Config(out=tmp_path / "o", variants=("gaussian", "flow"), seeds=(0, 1), flow_steps=2, **PEOPLE)
     generators.run(config)
     metrics = check(tmp_path / "o", "chosen", "validation", "real", "per_seed")

@@ -21,8 +21,10 @@ from experiments import (
     table2,
     unseen_subjects,
 )
-from facejax import fit_motion, motion_examples, pipeline
-from facejax.data import makehuman4d, motions, store
+from facejax.data import dataset, motions, transitions
+from facejax.data.synthetic import makehuman4d
+from facejax.inference import pipeline
+from facejax.training.recipes import fit_motion
 from tests.test_dense_experiments import tiny  # noqa: F401 (a fixture)
 from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
 
@@ -52,7 +54,7 @@ def own(tmp_path_factory):
         np.save(folder / f"{name}.npy", array)
     splits = ["train"] * 10 + ["validation"] * 4 + ["test"] * 5
     index = {
-        "schema": store.SCHEMA,
+        "schema": dataset.SCHEMA,
         "name": "own",
         "labels": LABELS,
         "rate": 30,
@@ -68,12 +70,12 @@ def own(tmp_path_factory):
 @pytest.fixture(scope="module")
 def model(own, tmp_path_factory):
     """Its motion, and the released way to meshes: the triangles are MakeHuman's."""
-    data, path = store.open_store(own), tmp_path_factory.mktemp("model") / "own.safetensors"
-    known = motions.join(*motion_examples.everything(data, "train", per_pair=8))
-    chart = motion_examples.chart_of(known, labels=len(LABELS), rank=motion_examples.rank_of(known))
-    examples = motion_examples.examples_of(chart, known)
+    data, path = dataset.open_store(own), tmp_path_factory.mktemp("model") / "own.safetensors"
+    known = motions.join(*transitions.everything(data, "train", per_pair=8))
+    chart = transitions.chart_of(known, labels=len(LABELS), rank=transitions.rank_of(known))
+    examples = transitions.examples_of(chart, known)
     motion = fit_motion.fit_flow(examples, chart, path.with_suffix(""), plan=fit_motion.FlowPlan(steps=2, batch=8))
-    starts = motion_examples.fit_starts(chart, motions.halves(data, "train"))
+    starts = transitions.fit_starts(chart, motions.halves(data, "train"))
     pipeline.save(path, pipeline.load()._replace(labels=LABELS, motion=motion, starts=starts))
     return path
 
@@ -91,8 +93,8 @@ def test_generated_motion(own_cache, own, model, experiment, tmp_path):  # noqa:
 
 
 def test_generators_are_chosen(own_cache, own, model, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(motion_examples, "SPREAD", 3)
-    monkeypatch.setattr(motion_examples, "CHARTED", 8)
+    monkeypatch.setattr(transitions, "SPREAD", 3)
+    monkeypatch.setattr(transitions, "CHARTED", 8)
     options = {"variants": ("gaussian", "flow"), "seeds": (0,), "flow_steps": 2}
     with pytest.raises(ValueError, match="the released models: expected the labels"):
         generators.run(generators.Config(out=tmp_path / "o", data=own, **options))
@@ -169,7 +171,7 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
 
 
 def test_a_take_is_carried_onto_itself_and_stretched(own):
-    data = store.open_store(own)
+    data = dataset.open_store(own)
     take = _transferred.stored(data, 14, "gape")
     np.testing.assert_allclose(_transferred.onto(take, take, data.landmark_index), take.landmarks, atol=2e-3)
     np.testing.assert_array_equal(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from facejax import cli
+from facejax.cli import main
 from tests.faults import table as faults
 
 ROOT = Path(__file__).parent.parent
@@ -33,8 +33,8 @@ def test_commands_parse(capsys, monkeypatch):
     assert len(lines) >= 5
     for line in lines:
         seen = []
-        monkeypatch.setattr(cli, "_COMMANDS", {kind: seen.append for kind in cli._COMMANDS})
-        cli.main(line.split())
+        monkeypatch.setattr(main, "_COMMANDS", {kind: seen.append for kind in main._COMMANDS})
+        main.main(line.split())
         assert len(seen) == 1, line
 
 

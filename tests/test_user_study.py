@@ -15,8 +15,9 @@ import pytest
 from PIL import Image
 
 from experiments import _run, _study, user_study
-from facejax import pipeline, runtime
-from facejax.data import makehuman
+from facejax.cli import runtime
+from facejax.data.synthetic import makehuman
+from facejax.inference import pipeline
 
 ROOT = Path(__file__).parents[1]
 TINY = {"composed": 2, "peaks": 2, "real": 1, "frames": 4, "width": 48}

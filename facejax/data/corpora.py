@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from facejax import files
-from facejax.io import arrays
+from facejax.io import atomic, npz
 
 SCHEMA = 1
 INDEX_BYTES = 3 << 23
@@ -34,7 +33,7 @@ class Shard(NamedTuple):
     sha256: str
 
 
-class CorpusError(files.FileError):
+class CorpusError(atomic.FileError):
     """A corpus that is not whole, or no corpus."""
 
 
@@ -56,11 +55,11 @@ class Corpus(NamedTuple):
         try:
             if path.stat().st_size != shard.bytes:
                 raise ValueError(f"{path.stat().st_size} bytes, expected {shard.bytes}")
-            found = arrays.read_npz(path, wanted)
+            found = npz.read_npz(path, wanted)
             if set(found) != set(wanted) or any(len(array) != shard.count for array in found.values()):
                 raise ValueError(f"expected {shard.count} of each of {', '.join(wanted)}")
             _check(found, self.index)
-        except (OSError, *arrays.DAMAGE) as error:
+        except (OSError, *npz.DAMAGE) as error:
             raise CorpusError(f"{path}: {error}; generate it again") from error
         return found
 
@@ -70,7 +69,7 @@ class Corpus(NamedTuple):
     def verify(self) -> None:
         """Read every byte. Raises `CorpusError` naming the first shard that is not as it was written."""
         for shard in self.shards:
-            if files.sha256(self.path / shard.file) != shard.sha256:
+            if atomic.sha256(self.path / shard.file) != shard.sha256:
                 raise CorpusError(f"{self.path / shard.file} is damaged: delete it and generate it again")
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from facejax import augment
-from facejax.data import store
+from facejax.data import dataset
 from facejax.geometry import srvf
 
 FRAMES = 30
@@ -39,7 +39,7 @@ class Motions(NamedTuple):
 
 
 def halves(
-    data: store.Store, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
+    data: dataset.Store, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
 ) -> Motions:
     """Every neutral -> peak and peak -> neutral motion of a split's subjects.
 
@@ -60,7 +60,7 @@ def halves(
     return _stack(rows)
 
 
-def directs(data: store.Store, split: str, *, frames: int = FRAMES) -> Motions:
+def directs(data: dataset.Store, split: str, *, frames: int = FRAMES) -> Motions:
     """The directly performed peak -> peak transitions of a split; no capture set has them, evaluation only."""
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=True):
@@ -122,7 +122,9 @@ def join(*parts: Motions) -> Motions:
     return Motions(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-def recordings(data: store.Store, split: str, *, direct: bool) -> Iterator[tuple[store.Sequence, np.ndarray, float]]:
+def recordings(
+    data: dataset.Store, split: str, *, direct: bool
+) -> Iterator[tuple[dataset.Sequence, np.ndarray, float]]:
     """Each sequence of a split, its displacements from neutral (T, L, 3), unitless, and the millimetres per unit."""
     members = set(data.subjects(split).tolist())
     rest = data.neutral[:, data.landmark_index]
@@ -134,7 +136,7 @@ def recordings(data: store.Store, split: str, *, direct: bool) -> Iterator[tuple
             yield sequence, (landmarks - neutral) / scale, scale
 
 
-def _seconds(sequence: store.Sequence, part: np.ndarray) -> float:
+def _seconds(sequence: dataset.Sequence, part: np.ndarray) -> float:
     return (len(part) - 1) * sequence.duration / sequence.frames
 
 

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import schemes
-from facejax.data import motions, store
+from facejax.data import dataset, motions
 from facejax.geometry import align
+from facejax.landmarks import schemes
 
 TAIL = 5  # frames of standing still after the end that a network learns from, so that it learns to stop
 
@@ -43,7 +43,7 @@ class Block(NamedTuple):
     neutral: np.ndarray  # (K, L, 3)
 
 
-def read(data: store.Store, split: str, labels: Sequence[str]) -> Sequences:
+def read(data: dataset.Store, split: str, labels: Sequence[str]) -> Sequences:
     """The recordings of a split's subjects under some labels, in the dataset's order.
 
     Raises `ValueError` for a label of which the split has no recording.

@@ -1,7 +1,31 @@
-"""Every file that a user names is read and written here."""
+"""Files in and out: meshes, landmarks, animations, weights. Every reader takes files from untrusted sources.
 
-from facejax.io import film, gltf, landmarks, meshes, page, props, render, scene
-from facejax.io.export import save
-from facejax.io.meshes import read as load_mesh
+`save` writes an animation in the format of the path's suffix (`facejax.io.export`), `load_mesh` reads a mesh
+(`facejax.io.meshes.read`). Both are imported when they are first used: pictures and films need `facejax.viz`.
+"""
 
-__all__ = ["film", "gltf", "landmarks", "load_mesh", "meshes", "page", "props", "render", "save", "scene"]
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from facejax.io import landmarks, meshes
+    from facejax.io.export import save
+    from facejax.io.meshes import read as load_mesh
+
+__all__ = ["landmarks", "load_mesh", "meshes", "save"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "save":
+        return importlib.import_module("facejax.io.export").save
+    if name == "load_mesh":
+        return importlib.import_module("facejax.io.meshes").read
+    if name in __all__:
+        return importlib.import_module(f"facejax.io.{name}")
+    raise AttributeError(f"module 'facejax.io' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

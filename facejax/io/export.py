@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from facejax import files
-from facejax.io import film, gltf, meshes, page, render, scene
+from facejax.io import atomic, glb_writer, meshes
+from facejax.viz import html_viewer, render, scene, video
 
 STRIP = 8  # pictures on a contact strip
 
@@ -55,20 +55,20 @@ def save(
     if name.endswith(("/", os.sep)) or path.is_dir():
         meshes.write_sequence(path, shot.vertices, shot.faces)
     elif suffix == ".glb":
-        gltf.write(path, *shot[:2], fps=fps, captions=captions, extras=extras, name=title)
+        glb_writer.write(path, *shot[:2], fps=fps, captions=captions, extras=extras, name=title)
     elif suffix == ".html":
         texts = {"fps": fps, "captions": captions, "title": title}
-        page.write(path, *shot[:2], **texts, landmarks=shot.landmarks, extras=extras, colours=colours)
-    elif suffix in film.FORMATS or suffix == ".png":
+        html_viewer.write(path, *shot[:2], **texts, landmarks=shot.landmarks, extras=extras, colours=colours)
+    elif suffix in video.FORMATS or suffix == ".png":
         if suffix != ".png":
-            film.check(path)
+            video.check(path)
         view = render.aim(shot.vertices, size=size) if camera is None else camera
         look = {"size": size, "camera": view}
         if suffix == ".png":
             _write_picture(path, shot, colours, look)
         else:
             pictures = _pictures(shot, colours, look)
-            film.write(path, render.caption(pictures, shot.captions) if shot.captions else pictures, fps=fps)
+            video.write(path, render.caption(pictures, shot.captions) if shot.captions else pictures, fps=fps)
     elif suffix == ".npz":
         _write_arrays(path, shot)
     elif suffix in (".ply", ".obj"):
@@ -98,7 +98,7 @@ def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
     if count > 1:
         labels = [_label(t, shot.captions) for t in chosen]
         pictures = [render.contact_sheet([pictures], column_labels=labels)]
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         Image.fromarray(pictures[0]).save(temporary)
 
 
@@ -114,5 +114,5 @@ def _write_arrays(path: Path, shot: scene.Scene) -> None:
     arrays = {"vertices": shot.vertices, "faces": shot.faces.astype(np.int32), "fps": np.float64(shot.fps)}
     if shot.landmarks is not None:
         arrays["landmarks"] = shot.landmarks
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         np.savez(temporary, **arrays)

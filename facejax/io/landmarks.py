@@ -21,8 +21,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from facejax import files
-from facejax.io import embedding
+from facejax.io import atomic, flame_embedding
 
 LIMIT = 2**22  # bytes of a file
 MOST = 10_000  # landmarks
@@ -31,7 +30,7 @@ _KINDS = (("indices",), ("faces", "weights"), ("points",))
 _ROWS = {1: "index", 3: "x y z", 4: "index x y z"}
 
 
-class LandmarkError(files.FileError):
+class LandmarkError(atomic.FileError):
     """A landmark file cannot be used; the message names the file, the line or entry, and what was expected."""
 
 
@@ -100,7 +99,7 @@ def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> No
     record = {"indices" if points is None else "points": values.tolist()}
     if names is not None:
         record["names"] = _names(list(names), len(values))
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         temporary.write_text(json.dumps(record), encoding="utf-8")
 
 
@@ -151,7 +150,7 @@ def _placed(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
 
 
 def _read_embedding(path: Path, mesh, faces) -> Landmarks:
-    face, weights = embedding.read(path)
+    face, weights = flame_embedding.read(path)
     if not 0 < len(face) <= MOST:
         raise ValueError(f"expected 1 to {MOST} landmarks, got {len(face)}")
     return Landmarks(_placed(face.tolist(), weights, mesh, faces), None)
@@ -288,5 +287,5 @@ _READERS = {
     ".json": _read_json,
     ".pp": _read_pp,
     **dict.fromkeys(_TEXTS, _read_text),
-    **dict.fromkeys(embedding.SUFFIXES, _read_embedding),
+    **dict.fromkeys(flame_embedding.SUFFIXES, _read_embedding),
 }

@@ -15,16 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax import files
-from facejax.io import arrays, glb, ply
-from facejax.io.arrays import DAMAGE, LIMIT
+from facejax.io import atomic, glb_reader, npz, ply
+from facejax.io.npz import DAMAGE, LIMIT
 
 _TEXT_LIMIT = 2**26  # bytes of an OBJ
 _LINE_LIMIT = 2**20
 _FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
 
 
-class MeshError(files.FileError):
+class MeshError(atomic.FileError):
     """A mesh file cannot be used; the message names the file, what is wrong and where."""
 
 
@@ -76,7 +75,7 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
       MeshError: as `read`.
     """
     path = Path(path)
-    found = _told(path, arrays.read_npz, ("vertices", "faces", "landmarks", "fps"))
+    found = _told(path, npz.read_npz, ("vertices", "faces", "landmarks", "fps"))
     vertices, faces = found.pop("vertices"), found.pop("faces", None)
     if faces is None and not bare:
         raise MeshError(f"{path}: has no triangles, nothing to show")
@@ -97,7 +96,7 @@ def count_frames(path: str | os.PathLike) -> int:
     Raises:
       MeshError: as `read_animation`, or other `vertices`.
     """
-    shape = _told(Path(path), arrays.shape_in_npz, "vertices")
+    shape = _told(Path(path), npz.shape_in_npz, "vertices")
     if len(shape) != 3 or 0 in shape or shape[2] != 3:
         raise MeshError(f"{path}: vertices must be (T, N, 3), got {shape}")
     return shape[0]
@@ -121,7 +120,7 @@ def write(path: str | os.PathLike, vertices, faces=None) -> None:
     faces = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
-    with files.replacing(path) as temporary:
+    with atomic.replacing(path) as temporary:
         writer(temporary, vertices, faces.astype(np.int32))
 
 
@@ -196,12 +195,12 @@ def _lines(path: Path):
 
 
 def _read_npz(path: Path):
-    found = arrays.read_npz(path, ("vertices", "faces"))
+    found = npz.read_npz(path, ("vertices", "faces"))
     return found.get("vertices"), found.get("faces")
 
 
 def _read_npy(path: Path):
-    return arrays.read_npy(path), None
+    return npz.read_npy(path), None
 
 
 def _told(path: Path, reader, *options):
@@ -248,5 +247,5 @@ def _write_npz(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     np.savez(path, vertices=vertices, faces=faces)
 
 
-_READERS = {".ply": ply.read, ".obj": _read_obj, ".glb": glb.read, ".npz": _read_npz, ".npy": _read_npy}
+_READERS = {".ply": ply.read, ".obj": _read_obj, ".glb": glb_reader.read, ".npz": _read_npz, ".npy": _read_npy}
 _WRITERS = {".ply": ply.write, ".obj": _write_obj, ".npz": _write_npz}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facejax import augment
-from facejax.data import motions, store
+from facejax.data import dataset, motions
 
 RATE = 30
 
@@ -40,10 +40,10 @@ def recorded(subjects=3, labels=("neutral", "a", "b", "c"), *, bend=0.3, direct=
             curve = first + weight[:, None, None] * (second - first)
             curve = curve + bend * (weight * (1 - weight))[:, None, None] * second[:, ::-1]
             name = f"{labels[start]}>{labels[end]}" if start else labels[end]
-            sequences.append(store.Sequence(subject, name, begin, frames, *marks.tolist(), frames / RATE))
+            sequences.append(dataset.Sequence(subject, name, begin, frames, *marks.tolist(), frames / RATE))
             rows.append(neutral[subject, index] + curve)
             begin += frames
-    return store.Store(
+    return dataset.Store(
         Path("made-up"),
         {"labels": list(labels), "rate": RATE, "subjects": [{"split": split}] * subjects},
         tuple(sequences),

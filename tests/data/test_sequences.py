@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from facejax import schemes
 from facejax.data import sequences
+from facejax.landmarks import schemes
 
 
 def made(lengths, landmarks=4, seed=0):

@@ -129,14 +129,13 @@ def main() -> None:
     bomb = BOMBS[name]
     path = folder / bomb.name
     bomb.write(path)
-    from facejax import weights
-    from facejax.data import corpora, livelink, store
-    from facejax.io import landmarks, meshes, pickles
+    from facejax.data import corpora, dataset
+    from facejax.io import landmarks, livelink, meshes, safe_pickle, weights
 
     readers = {
-        "mesh": (meshes.read, meshes.MeshError), "pickle": (pickles.read, pickles.PickleError),
+        "mesh": (meshes.read, meshes.MeshError), "pickle": (safe_pickle.read, safe_pickle.PickleError),
         "livelink": (livelink.read, livelink.RecordingError), "landmarks": (landmarks.read, landmarks.LandmarkError),
-        "store": (lambda path: store.open_store(path.parent), store.StoreError),
+        "store": (lambda path: dataset.open_store(path.parent), dataset.StoreError),
         "corpus": (lambda path: corpora.load(path.parent), corpora.CorpusError),
         "weights": (lambda path: weights.load(path, {}), weights.WeightsError),
     }  # fmt: skip

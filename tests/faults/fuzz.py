@@ -132,9 +132,10 @@ OBJ += b"f 1/1/1 2/1/1 3/1/1\nf 1 3 4 5\nf -3 -2 -1\nusemtl m\n"
 
 def readers() -> dict[str, Callable[[], Reader]]:
     """By name."""
-    from facejax import pipeline, weights
-    from facejax.data import corpora, livelink, source, store, tables
-    from facejax.io import landmarks, meshes, pickles
+    from facejax.data import corpora, dataset
+    from facejax.data.importers import base, tables
+    from facejax.inference import pipeline
+    from facejax.io import landmarks, livelink, meshes, safe_pickle, weights
 
     def mesh(suffix: str, *contents: bytes) -> Reader:
         return Reader(suffix, list(contents), meshes.read, (meshes.MeshError,))
@@ -166,17 +167,17 @@ def readers() -> dict[str, Callable[[], Reader]]:
         arrays = {"faces": FACES, "neutral": VERTICES[None].astype("f4"), "vertices": VERTICES[None].astype("f4")}
         arrays |= {"landmarks": VERTICES[None, :2].astype("f4"), "drawn": np.zeros(1, np.int64)}
         arrays["landmark_index"] = np.arange(2, dtype=np.int32)
-        row = store.Sequence(0, "smile", 0, 1, 0, 0, 0, 0, 1.0, "a")._asdict()
+        row = dataset.Sequence(0, "smile", 0, 1, 0, 0, 0, 0, 1.0, "a")._asdict()
         index = {"schema": 1, "name": "n", "labels": ["neutral", "smile"], "rate": 30.0, "spec": {}, "sequences": [row]}
         index |= {"shapes": {name: array.shape for name, array in arrays.items()}, "notes": []}
         index["subjects"] = [{"name": "A", "split": "train"}]
 
         def use(path: Path) -> object:
-            found = store.open_store(path)
+            found = dataset.open_store(path)
             return found.labels, found.people(), found.row_subjects(), found.row_labels(), found.meshes("train")
 
         whole = {f"{name}.npy": npy(array) for name, array in arrays.items()}
-        return Reader(".json", [json.dumps(index).encode()], in_folder("index.json", whole, use), (store.StoreError,))
+        return Reader(".json", [json.dumps(index).encode()], in_folder("index.json", whole, use), (dataset.StoreError,))
 
     def corpus_index() -> Reader:
         data = npz(landmarks=np.zeros((2, 3, 5, 3), "f4"), labels=np.zeros((2, 2), "i4"), person=np.zeros(2, "i4"))
@@ -207,7 +208,7 @@ def readers() -> dict[str, Callable[[], Reader]]:
     def csv() -> Reader:
         text = b"subject,recording,label\nA,one,smile\n# c\nB,two,frown\n"
         return Reader(
-            ".csv", [text], lambda path: tables.read(path, ("subject", "recording", "label")), (source.SourceError,)
+            ".csv", [text], lambda path: tables.read(path, ("subject", "recording", "label")), (base.SourceError,)
         )
 
     def recording() -> Reader:
@@ -222,7 +223,9 @@ def readers() -> dict[str, Callable[[], Reader]]:
 
     def pickled() -> Reader:
         data = {"a": VERTICES, "names": ["x", "y"], "deep": {1: (2, 3.5, None)}, "i": FACES, "s": np.float64(2.0)}
-        return Reader(".pkl", [pickle.dumps(data, protocol=p) for p in range(5)], pickles.read, (pickles.PickleError,))
+        return Reader(
+            ".pkl", [pickle.dumps(data, protocol=p) for p in range(5)], safe_pickle.read, (safe_pickle.PickleError,)
+        )
 
     glb = written(_write_glb, ".glb")
     static = {"lmk_face_idx": np.array([0, 1]), "lmk_b_coords": np.full((2, 3), 1 / 3)}

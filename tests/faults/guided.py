@@ -23,7 +23,6 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 WATCHED = [
     "facejax.io",
     "facejax.data",
-    "facejax.weights",
     "numpy.lib._format_impl",
     "zipfile",
     "pickle",

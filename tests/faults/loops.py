@@ -17,65 +17,65 @@ STEPS, EVERY = 24, 4
 
 
 def motions():
-    from facejax import motion_examples
+    from facejax.data import transitions
     from tests.data.test_motions import recorded
 
-    known = motion_examples.transitions(recorded(subjects=6), "train", per_pair=6)
-    chart = motion_examples.chart_of(known, labels=4, rank=8, pose=4)
-    return known, chart, motion_examples.examples_of(chart, [known])
+    known = transitions.transitions(recorded(subjects=6), "train", per_pair=6)
+    chart = transitions.chart_of(known, labels=4, rank=8, pose=4)
+    return known, chart, transitions.examples_of(chart, [known])
 
 
 def gan(folder, mesh):
-    from facejax import fit_motion
-    from facejax.models import motion
+    from facejax.models.motion import motion3dgan
+    from facejax.training.recipes import fit_motion
 
     _, chart, examples = motions()
     plan = fit_motion.GanPlan(steps=STEPS, batch=4, critic_steps=2)
-    config = motion.Config(width=16, blocks=1, noise=4, embedding=4)
+    config = motion3dgan.Config(width=16, blocks=1, noise=4, embedding=4)
     return fit_motion.fit_gan(examples, chart, folder, plan=plan, config=config, mesh=mesh)
 
 
 def flow(folder, mesh):
-    from facejax import fit_motion
-    from facejax.models import flow
+    from facejax.models.motion import flow_matching
+    from facejax.training.recipes import fit_motion
 
     _, chart, examples = motions()
     plan = fit_motion.FlowPlan(steps=STEPS, batch=8)
     return fit_motion.fit_flow(
-        examples, chart, folder, plan=plan, config=flow.Config(width=16, blocks=1, embedding=4), mesh=mesh
+        examples, chart, folder, plan=plan, config=flow_matching.Config(width=16, blocks=1, embedding=4), mesh=mesh
     )
 
 
 def reference(folder, mesh):
-    from facejax import fit_motion
-    from facejax.models import motion_reference
+    from facejax.models.motion import motion3dgan_reference
+    from facejax.training.recipes import fit_motion
 
     known, chart, _ = motions()
     plan = fit_motion.REFERENCE._replace(steps=STEPS, batch=2, critic_steps=2)
-    config = motion_reference.Config(width_divisor=16, noise=4)
+    config = motion3dgan_reference.Config(width_divisor=16, noise=4)
     return fit_motion.fit_reference(known, chart, folder, plan=plan, config=config, mesh=mesh)
 
 
 def balls():
-    from facejax.data import meshes
-    from facejax.mesh import topology
+    from facejax.data import mesh_subset
+    from facejax.mesh import hierarchy as mesh_hierarchy
     from tests.balls import store_of_balls
 
     data = store_of_balls()
     template = data.neutral.mean(axis=0, dtype=np.float64)
-    hierarchy = topology.build(template, data.faces, factors=(2, 2, 2, 2), lengths=3)
-    return data, meshes.of_split(data, "train", size=20), hierarchy
+    hierarchy = mesh_hierarchy.build(template, data.faces, factors=(2, 2, 2, 2), lengths=3)
+    return data, mesh_subset.of_split(data, "train", size=20), hierarchy
 
 
 def decoder(folder, mesh):
-    from facejax import fit_decoder
+    from facejax.training.recipes import fit_s2d_dec
 
     _, train, hierarchy = balls()
-    return fit_decoder.fit(train, hierarchy, folder, plan=fit_decoder.Plan(steps=STEPS, batch=8), mesh=mesh)
+    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.Plan(steps=STEPS, batch=8), mesh=mesh)
 
 
 def residual(folder, mesh):
-    from facejax import fit_gpmm, fit_residual
+    from facejax.training.recipes import fit_gpmm, fit_residual
 
     _, train, hierarchy = balls()
     base, plan = fit_gpmm.fit(train, components=20), fit_residual.Plan(steps=STEPS, batch=8)
@@ -83,7 +83,7 @@ def residual(folder, mesh):
 
 
 def neural3dmm(folder, mesh):
-    from facejax import fit_neural3dmm
+    from facejax.training.recipes import fit_neural3dmm
 
     _, train, hierarchy = balls()
     plan = fit_neural3dmm.Plan(steps=STEPS, batch=8)
@@ -91,15 +91,15 @@ def neural3dmm(folder, mesh):
 
 
 def expressions(folder, mesh):
-    from facejax import fit_expressions
     from facejax.data import sequences
-    from facejax.models import sequence
+    from facejax.models import expression_lstm
+    from facejax.training.recipes import fit_expression_lstm
 
     data, _, _ = balls()
     labels = {name: data.labels.index(name) for name in ("a", "b")}
-    plan, config = fit_expressions.ExpressionPlan(steps=STEPS, batch=2), sequence.Config(hidden=8, layers=2)
+    plan, config = fit_expression_lstm.ExpressionPlan(steps=STEPS, batch=2), expression_lstm.Config(hidden=8, layers=2)
     known = sequences.read(data, "train", tuple(labels))
-    return fit_expressions.fit(known, folder, labels=labels, plan=plan, config=config)
+    return fit_expression_lstm.fit(known, folder, labels=labels, plan=plan, config=config)
 
 
 LOOPS = {loop.__name__: loop for loop in (gan, flow, reference, decoder, residual, neural3dmm, expressions)}
@@ -123,7 +123,8 @@ def main() -> None:
     parser.add_argument("--plain", type=float, help="one step down the gradient, at this rate")
     parser.add_argument("--save", type=Path, help="an NPZ for the parameters")
     given = parser.parse_args()
-    from facejax import parallel, runtime, training
+    from facejax.cli import runtime
+    from facejax.training import loop, sharding
 
     jax.config.update("jax_num_cpu_devices", given.devices)
     if given.distributed:
@@ -132,7 +133,7 @@ def main() -> None:
     several = given.distributed or given.devices > 1
     if given.plain:
         plainly(given.plain)
-    run = training.run
+    run = loop.run
 
     def frequent(step, state, batches, folder, **options):
         def slow(first, count):
@@ -144,8 +145,8 @@ def main() -> None:
         often = {"chunk": EVERY // 2, "save_steps": EVERY} | ({"steps": 1} if given.plain else {})
         return run(step, state, slow, folder, **options | often)
 
-    training.run = frequent
-    leaves = jax.tree.leaves(LOOPS[given.loop](given.folder, parallel.line() if several else None))
+    loop.run = frequent
+    leaves = jax.tree.leaves(LOOPS[given.loop](given.folder, sharding.line() if several else None))
     found = hashlib.sha256()
     for leaf in leaves:
         found.update(np.ascontiguousarray(leaf).tobytes())

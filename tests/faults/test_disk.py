@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from facejax import io, weights
+from facejax import io
+from facejax.io import weights
 from tests.faults._record import outcome
 from tests.faults.test_kills import LOOP, ROOT, contents, finished, newest, started
 

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from facejax import pipeline
 from facejax.data import corpora
+from facejax.inference import pipeline
 from tests.faults import loops
 from tests.faults._record import TRIES, outcome
 from tests.faults.test_kills import LOOP, contents, finished, started

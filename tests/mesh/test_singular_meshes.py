@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from facejax.mesh import decimation, nearest, ops, strain, transfer
+from facejax.mesh import closest_point, decimation, deformation_transfer, spiral_conv, strain
 from tests.near import COUNT, finite
 
 FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]], np.int32)  # three triangles about vertex 0
@@ -27,7 +27,7 @@ def fans():
 
 def test_normals(dtype):
     vertices = jnp.asarray(fans(), dtype)
-    found = np.asarray(finite(lambda vertices: ops.vertex_normals(vertices, FACES), vertices), np.float64)
+    found = np.asarray(finite(lambda vertices: spiral_conv.vertex_normals(vertices, FACES), vertices), np.float64)
     length = np.linalg.norm(found, axis=-1)
     assert (np.minimum(np.abs(length - 1), length) < 8 * np.finfo(dtype).eps).all()
     assert (length[:150] == 0).all() and (length[154::5] > 0).all()
@@ -73,10 +73,10 @@ def test_the_nearest_points_of_a_surface_of_such_triangles():
     rng = np.random.default_rng(3)
     vertices = fans()[:500].reshape(-1, 3)
     faces = (4 * np.arange(500)[:, None, None] + FACES).reshape(-1, 3)
-    on = nearest.surface(vertices, faces)
+    on = closest_point.surface(vertices, faces)
     points = np.concatenate([vertices[rng.integers(len(vertices), size=COUNT // 10)], rng.normal(size=(1_000, 3))])
     for normals in (None, rng.normal(size=points.shape)):
-        hits = nearest.query(on, points, normals=normals)
+        hits = closest_point.query(on, points, normals=normals)
         assert all(np.isfinite(part).all() for part in hits)
         assert (hits.weights >= 0).all() and np.abs(hits.weights.sum(axis=1) - 1).max() < 1e-12
     assert np.isfinite(on.normals).all()
@@ -85,4 +85,4 @@ def test_the_nearest_points_of_a_surface_of_such_triangles():
 def test_a_face_with_a_triangle_of_no_area_carries_nothing():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.5, 0]])
     with pytest.raises(ValueError, match="triangle 1 has no area"):
-        transfer.gradient(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+        deformation_transfer.gradient(vertices, np.array([[0, 1, 2], [0, 2, 3]]))

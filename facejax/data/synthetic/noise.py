@@ -1,0 +1,46 @@
+"""Registration noise: what fitting a template to scans leaves behind, smooth over the surface, new in every frame.
+
+A field is a sum of Gaussian bumps about centres spread over the template, with random heights, scaled so that every
+vertex moves by `sigma` millimetres in root mean square. N vertices, C centres.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from facejax.data.synthetic import makehuman
+from facejax.mesh import graph
+
+WIDTH = 15.0  # millimetres, geodesic
+SPACING = 1.2  # centres per width
+LIMIT = 2.0  # millimetres
+
+
+def field(frames: int, rng: np.random.Generator, *, sigma: float) -> np.ndarray:
+    """Displacements (frames, N, 3) float32. Raises `ValueError` for a sigma outside 0..2 mm."""
+    check(sigma)
+    basis = _basis()
+    heights = rng.standard_normal((frames, 3, basis.shape[1]), np.float32)
+    return np.ascontiguousarray(np.moveaxis(heights @ basis.T, 1, 2)) * np.float32(sigma / np.sqrt(3))
+
+
+def check(sigma: float) -> None:
+    """Raise `ValueError` for a sigma outside 0..2 mm."""
+    if not 0 <= sigma <= LIMIT:
+        raise ValueError(f"noise must lie in 0..{LIMIT:g} mm, got {sigma}")
+
+
+@functools.cache
+def _basis() -> np.ndarray:
+    """(N, C) bumps; the squares of every row sum to 1, so that each vertex has the same variance."""
+    shape = makehuman.template()
+    distance = [graph.geodesic(shape.vertices, shape.faces, [0])]
+    nearest = distance[0]
+    # Farthest points first, until the surface is covered.
+    while nearest.max() > WIDTH / SPACING:
+        distance.append(graph.geodesic(shape.vertices, shape.faces, [int(np.argmax(nearest))]))
+        nearest = np.minimum(nearest, distance[-1])
+    bumps = np.exp(-0.5 * (np.stack(distance, axis=1) / WIDTH) ** 2)
+    return (bumps / np.linalg.norm(bumps, axis=1, keepdims=True)).astype(np.float32)

@@ -1,0 +1,162 @@
+"""A subject's face as a function of its expression units, on a ladder of realism.
+
+Level 0   linear: neutral + weights @ units, the units averaged over ethnicities.
+Level 1   the subject's own mixture of the ethnic variants; units saturate; the jaw rotates about its hinge.
+Level 2   the units are carried to the subject's shape by deformation transfer; eyelids slide on the eyeball, lips
+          pass neither through one another nor through the teeth (`facejax.data.contact`).
+Level 3   skin wrinkles and bulges where it is compressed (`facejax.data.skin`).
+
+Every level is a function of the weights and the subject alone: nothing is random per frame.
+
+Shapes: T frames, U units, N skin vertices, M = N + props' vertices. Millimetres.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from facejax.data.synthetic import assets, contact, makehuman, skin
+from facejax.mesh import deformation_transfer
+
+LEVELS = (0, 1, 2, 3)
+SATURATION = 0.35  # f(w) = (1 + k) w / (1 + k |w|): f(1) = 1, f(0.5) = 0.57
+JAW_LANDMARKS = (0, 16)  # beside the ears: the hinge lies behind them
+HINGE_OFFSET = np.array([0.0, -8.0, -8.0])
+ANCHOR = 1e-7  # weight of "stay at the plain offset" in deformation transfer, against the gradient term
+
+
+class Rig(NamedTuple):
+    """One subject at one level of realism; `pose` moves it."""
+
+    level: int
+    neutral: np.ndarray  # (M, 3)
+    units: np.ndarray  # (U, M, 3) offsets at weight 1; the jaw's row holds what its rotation leaves over
+    hinge: np.ndarray  # (3,) a point of the jaw's axis, which is parallel to x
+    jaw_angle: np.ndarray  # (M,) radians at weight 1
+    contact: contact.Contact | None  # levels 2 and 3
+    skin: skin.Skin | None  # level 3
+
+
+@functools.cache
+def unit_names() -> tuple[str, ...]:
+    """The U units: ARKit's 51 that move skin, then MakeHuman's 34."""
+    names = list(assets.load().targets)
+    arkit = [n.split("/")[1] for n in names if n.startswith("arkit/") and n != "arkit/tongueOut"]
+    human = [n.split("/")[2] for n in names if n.startswith("unit/caucasian/")]
+    return (*arkit, *human)
+
+
+def build(subject: makehuman.Subject, *, level: int = 3) -> Rig:
+    """The rig of a subject. Raises `ValueError` for a level that is not 0 to 3."""
+    if level not in LEVELS:
+        raise ValueError(f"realism level must be one of {LEVELS}, got {level}")
+    loaded = assets.load()
+    neutral = subject.neutral.astype(np.float64)
+    units = _units(subject.ethnicity if level >= 1 else np.full(3, 1 / 3))
+    if level >= 2:
+        units = _transfer(units, neutral)
+    jaw = unit_names().index("jawOpen")
+    hinge = neutral[loaded.landmarks[list(JAW_LANDMARKS)]].mean(axis=0) + HINGE_OFFSET
+    angle = np.zeros(len(neutral))
+    if level >= 1:
+        angle, residual = _split_jaw(neutral, units[jaw], hinge)
+        units[jaw] = residual
+    return Rig(
+        level=level,
+        neutral=subject.neutral,
+        units=units.astype(np.float32),
+        hinge=hinge.astype(np.float32),
+        jaw_angle=angle.astype(np.float32),
+        contact=contact.build(subject) if level >= 2 else None,
+        skin=skin.build(subject) if level >= 3 else None,
+    )
+
+
+def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
+    """Unit weights (T, U) -> vertices (T, M, 3) float32, skin first, then the props."""
+    weights = np.asarray(weights, np.float32)
+    count, vertices, _ = rig.units.shape
+    if weights.ndim != 2 or weights.shape[1] != count:
+        raise ValueError(f"expected unit weights of shape (T, {count}), got {weights.shape}")
+    active = saturate(weights) if rig.level >= 1 else weights
+    moved = rig.neutral + (active @ rig.units.reshape(count, -1)).reshape(-1, vertices, 3)
+    if rig.contact is not None:
+        moved = contact.keep_off_teeth(rig.contact, moved)
+    if rig.level >= 1:
+        # The jaw opens by angle, in proportion to the unsaturated weight: its path is an arc, not a chord.
+        moved = _rotate_jaw(rig, moved, weights[:, unit_names().index("jawOpen")])
+    if rig.contact is not None:
+        moved = contact.part_lips(rig.contact, contact.slide_lids(rig.contact, moved))
+    if rig.skin is not None:
+        moved = skin.fold(rig.skin, moved)
+    return moved
+
+
+def saturate(weights: np.ndarray) -> np.ndarray:
+    """Muscle shortening has diminishing returns: f(w) = (1 + k) w / (1 + k |w|)."""
+    return (1 + SATURATION) * weights / (1 + SATURATION * np.abs(weights))
+
+
+def _units(ethnicity: np.ndarray) -> np.ndarray:
+    targets = assets.load().targets
+    rows = []
+    for name in unit_names():
+        if f"arkit/{name}" in targets:
+            rows.append(targets[f"arkit/{name}"].astype(np.float64))
+        else:
+            variants = (targets[f"unit/{e}/{name}"] for e in assets.ETHNICITIES)
+            rows.append(sum(share * v.astype(np.float64) for share, v in zip(ethnicity, variants, strict=True)))
+    return np.stack(rows)
+
+
+def _split_jaw(neutral: np.ndarray, offset: np.ndarray, hinge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Opening as rotation about x by an angle per vertex (M,), and what remains (M, 3), linear in the weight.
+
+    The remainder rides along with the rotation, so it is given in the frame before it.
+    """
+    before = neutral - hinge
+    after = before + offset
+    cross = before[:, 1] * after[:, 2] - before[:, 2] * after[:, 1]
+    dot = before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2]
+    angle = np.where(np.linalg.norm(offset, axis=1) > 0, np.arctan2(cross, dot), 0.0)
+    # Close to the hinge a tiny offset can mean any angle: let its share fade out within 25 mm.
+    angle *= np.clip(np.linalg.norm(before[:, 1:], axis=1) / 25.0, 0, 1) ** 2
+    return angle, _rotate_x(after, -angle) - before
+
+
+def _rotate_x(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    return np.stack([x, cos * y - sin * z, sin * y + cos * z], axis=-1)
+
+
+def _rotate_jaw(rig: Rig, moved: np.ndarray, opening: np.ndarray) -> np.ndarray:
+    """Turn every vertex about the hinge, with whatever the other units did to it riding along."""
+    return rig.hinge + _rotate_x(moved - rig.hinge, opening[:, None] * rig.jaw_angle)
+
+
+def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    """Carry the units' deformation gradients from the template to the subject (Sumner and Popovic 2004, linear form).
+
+    For each coordinate of each unit: the surface gradient on the template, projected to the subject's triangles,
+    integrated by a Poisson solve. The scalp and neck, which no unit moves, anchor it.
+    """
+    loaded = assets.load()
+    n = loaded.skin
+    source, _ = deformation_transfer.gradient(makehuman.template().vertices.astype(np.float64), loaded.faces)
+    target, areas = deformation_transfer.gradient(neutral[:n], loaded.faces)
+    weight = sparse.diags(np.repeat(areas, 3))
+    offsets = np.moveaxis(units[:, :n], 1, 0).reshape(n, -1)
+    still = np.abs(offsets).max(axis=1) < 1e-6
+    anchor = sparse.diags(np.where(still, 1.0, ANCHOR) * areas.mean())
+    solved = splu((target.T @ weight @ target + anchor).tocsc()).solve(
+        target.T @ (weight @ (source @ offsets)) + anchor @ offsets
+    )
+    carried = units.copy()
+    carried[:, :n] = np.moveaxis(solved.reshape(n, len(units), 3), 0, 1)
+    return carried

@@ -1,0 +1,192 @@
+"""What skin does where the face compresses it: furrows across the compression, and bulges of the flesh.
+
+A furrow group has, on the template, a mask, a coordinate s (millimetres across its furrows) and a profile: a wave
+for foreheads and crow's feet, a single fold for the nasolabial line. On a posed face the stretch along the gradient
+of s is measured triangle by triangle; where it is below 1 the profile is pushed out along the normal, deeper with
+age. Bulges follow the loss of area. Both depend on the face, its age and its pose alone, and vanish at rest.
+
+Wavelengths follow the mesh: three edges at least (8 mm on the forehead, 3 mm about the eyes).
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from facejax.data.synthetic import assets, makehuman
+
+YOUNG, OLD = 20.0, 80.0
+SLACK = 0.03  # compression that skin takes up before it folds
+STIFFNESS = 7.0  # tanh(STIFFNESS x compression): three quarters of the depth at 14 %
+BULGE_SMOOTHING = 3  # rounds of averaging of the area loss over neighbours
+
+
+class Furrow(NamedTuple):
+    """One group of furrows on the template."""
+
+    mask: np.ndarray  # (N,) 0..1
+    across: np.ndarray  # (N,) millimetres
+    wavelength: float  # 0 for a single fold at across = 0
+    depth: tuple[float, float]  # millimetres at 20 and at 80 years
+
+
+class Pattern(NamedTuple):
+    """The template's furrows and flesh, with each triangle given to the group that is strongest there."""
+
+    furrows: tuple[Furrow, ...]
+    owner: np.ndarray  # (F,) group of a triangle
+    flesh: np.ndarray  # (N,) millimetres of bulge at full compression
+    to_vertices: sparse.csr_matrix  # (N, F) mean over a vertex's triangles
+    smooth: sparse.csr_matrix  # (N, N) mean over a vertex and its neighbours
+
+
+class Skin(NamedTuple):
+    """A subject's skin."""
+
+    rest_area: np.ndarray  # (F,)
+    along: np.ndarray  # (F, 2) unit direction across the furrows, in the triangle's two edge vectors
+    height: np.ndarray  # (N,) signed millimetres of the furrows at full compression
+    flesh: np.ndarray  # (N,)
+
+
+def build(subject: makehuman.Subject) -> Skin:
+    """Lay the template's pattern on a subject: its own phase, and its age's depth."""
+    faces, pattern = assets.load().faces, template_pattern()
+    vertices = subject.vertices.astype(np.float64)
+    age = np.clip((subject.age - YOUNG) / (OLD - YOUNG), 0, 1)
+    # The phase is a trait: drawn from the subject's own shape, so that the same face always folds alike.
+    rng = np.random.default_rng(np.frombuffer(subject.neutral.tobytes()[:64], np.uint32))
+    height = np.zeros(len(vertices))
+    for furrow in pattern.furrows:
+        depth = furrow.depth[0] + age * (furrow.depth[1] - furrow.depth[0])
+        height += depth * furrow.mask * _profile(furrow, rng.uniform(0, 2 * np.pi))
+    return Skin(
+        rest_area=_areas(vertices[None], faces)[0].astype(np.float32),
+        along=_directions(vertices, faces, pattern).astype(np.float32),
+        height=height.astype(np.float32),
+        flesh=(pattern.flesh * (1 - 0.3 * age)).astype(np.float32),
+    )
+
+
+def fold(skin: Skin, vertices: np.ndarray) -> np.ndarray:
+    """Posed vertices (T, M, 3) -> the same with furrows and bulges on the skin, (T, M, 3)."""
+    faces, pattern = assets.load().faces, template_pattern()
+    n = len(skin.height)
+    first, second = (vertices[:, faces[:, i]] - vertices[:, faces[:, 0]] for i in (1, 2))
+    normal = np.cross(first, second)
+    area = 0.5 * np.linalg.norm(normal, axis=-1)
+    stretch = np.linalg.norm(first * skin.along[:, :1] + second * skin.along[:, 1:], axis=-1)
+    compression = _average(pattern.to_vertices, 1.0 - stretch)
+    loss = _average(pattern.to_vertices, 1.0 - area / skin.rest_area)
+    for _ in range(BULGE_SMOOTHING):
+        loss = _average(pattern.smooth, loss)
+    lift = skin.height * _response(compression) + skin.flesh * _response(loss)
+    outward = np.stack([_average(pattern.to_vertices, normal[..., i]) for i in range(3)], axis=-1)
+    outward /= np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-12)
+    moved = vertices.copy()
+    moved[:, :n] += lift[..., None] * outward
+    return moved
+
+
+@functools.cache
+def template_pattern() -> Pattern:
+    """Furrows and flesh, placed by the template's landmarks."""
+    shape = makehuman.template()
+    v, mark = shape.vertices.astype(np.float64), shape.vertices[shape.landmarks].astype(np.float64)
+    front = _step(v[:, 2], -5, 15)
+
+    def spot(centre, radius):
+        return np.exp(-0.5 * (np.linalg.norm(v - centre, axis=1) / radius) ** 2) * front
+
+    def middle(*indices):
+        return mark[list(indices)].mean(axis=0)
+
+    y, x = v[:, 1], v[:, 0]
+    brow = middle(19, 24)[1]
+    forehead = _step(y, brow + 2, brow + 14) * _step(-y, -brow - 62, -brow - 42) * _step(-np.abs(x), -56, -34) * front
+    furrows = [
+        Furrow(forehead, y, 21.0, (0.25, 1.0)),
+        Furrow(spot(middle(21, 22) + [0, 3, 0], 9), x, 14.0, (0.3, 1.1)),
+        Furrow(spot(middle(27, 28), 8), y, 10.0, (0.2, 0.7)),
+        Furrow(spot(middle(8, 57), 10), y, 17.0, (0.3, 0.6)),
+    ]
+    for side, corner, lid, wing, mouth in ((-1, 36, (40, 41), 31, 48), (1, 45, (46, 47), 35, 54)):
+        furrows.append(Furrow(spot(mark[corner] + [side * 11, 0, -5], 9), y, 9.0, (0.2, 0.9)))
+        furrows.append(Furrow(spot(middle(*lid) + [0, -7, 0], 8), y, 9.0, (0.15, 0.6)))
+        across, mask = _nasolabial(v, mark[wing] + [side * 7, 3, 0], mark[mouth] + [side * 10, 1, 0], side)
+        furrows.append(Furrow(mask * front, across, 0.0, (0.5, 1.7)))
+    flesh = 3.0 * (spot(middle(41, 48) + [-6, 2, 0], 16) + spot(middle(46, 54) + [6, 2, 0], 16))
+    flesh += 1.5 * spot(middle(8, 57), 12) + 1.2 * spot(middle(51, 57), 14) + 0.6 * forehead
+    masks = np.stack([f.mask for f in furrows])
+    to_vertices, smooth = _averaging(shape.faces, len(v))
+    owner = masks[:, shape.faces].mean(axis=-1).argmax(axis=0)
+    return Pattern(tuple(furrows), owner, flesh, to_vertices, smooth)
+
+
+def _nasolabial(v, start, end, side) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance from the line nose wing -> beside the mouth's corner (outward positive), and its mask."""
+    axis = (end - start)[:2]
+    length = np.linalg.norm(axis)
+    axis = axis / length
+    offset = v[:, :2] - start[:2]
+    along = offset @ axis
+    across = side * (offset @ np.array([-axis[1], axis[0]])) * np.sign(-axis[1])
+    mask = _step(along, -4, 6) * _step(-along, -length - 8, -length + 4) * np.exp(-0.5 * (across / 12.0) ** 2)
+    return across, mask
+
+
+def _profile(furrow: Furrow, phase: float) -> np.ndarray:
+    s = furrow.across
+    if furrow.wavelength:
+        return np.cos(2 * np.pi * s / furrow.wavelength + phase)
+    return np.exp(-(((s - 9) / 6.0) ** 2)) - np.exp(-((s / 4.0) ** 2))
+
+
+def _directions(vertices: np.ndarray, faces: np.ndarray, pattern: Pattern) -> np.ndarray:
+    """Per triangle, the unit direction in which its group's coordinate grows, in the basis of its two edges: (F, 2)."""
+    across = np.stack([f.across for f in pattern.furrows])[pattern.owner[:, None], faces]
+    first, second = (vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
+    gram = np.stack(
+        [
+            np.stack([(first * first).sum(-1), (first * second).sum(-1)], axis=-1),
+            np.stack([(first * second).sum(-1), (second * second).sum(-1)], axis=-1),
+        ],
+        axis=-2,
+    )
+    gradient = np.linalg.solve(gram, (across[:, 1:] - across[:, :1])[..., None])[..., 0]
+    length = np.sqrt(np.einsum("fi,fij,fj->f", gradient, gram, gradient))
+    return gradient / np.maximum(length, 1e-9)[:, None]
+
+
+def _response(compression: np.ndarray) -> np.ndarray:
+    """0 for stretched skin, smooth at the onset, saturating: values in 0..1."""
+    folded = np.maximum(compression, 0.0)
+    return np.tanh(STIFFNESS * folded * folded / (folded + SLACK))
+
+
+def _averaging(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+    rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+    incidence = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, len(faces)))
+    neighbours = ((incidence @ incidence.T) > 0).astype(float)
+    return (
+        (sparse.diags(1 / incidence.sum(axis=1).A1) @ incidence).tocsr().astype(np.float32),
+        (sparse.diags(1 / neighbours.sum(axis=1).A1) @ neighbours).tocsr().astype(np.float32),
+    )
+
+
+def _average(matrix: sparse.csr_matrix, values: np.ndarray) -> np.ndarray:
+    """Apply a (A, B) operator to (T, B) -> (T, A)."""
+    return (matrix @ values.T).T
+
+
+def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[:, faces[:, i]] for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+
+
+def _step(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    t = np.clip((x - low) / (high - low), 0, 1)
+    return t * t * (3 - 2 * t)

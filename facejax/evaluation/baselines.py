@@ -1,0 +1,198 @@
+"""Every way from landmarks to a mesh behind one interface, to be compared or swapped.
+
+    method = methods.METHODS["ridge"]
+    params = method.fit(train, folder, options)
+    vertices = method.apply(params, landmark_displacements, neutral)
+
+`train` is a selection of meshes (`facejax.data.meshes`); `folder` keeps checkpoints of what is trained step by step,
+which goes on from there when called again. `apply` takes the displacements (T, L, 3) of one face and that face at rest
+(N, 3), in mm, and gives its vertices (T, N, 3).
+
+s2d            S2D-Dec (Otberdout et al. 2023)
+s2d_residual   the best linear answer, refined by a spiral decoder that sees the face; `gpmm` is that answer alone
+ridge          ridge regression, the bar that tables leave out
+pca38, pca220  3DMM of so many principal components of displacements: the paper's expression-specific one
+pca220_mean    the paper's common 3DMM: components of whole meshes about their overall mean
+dl3dmm         dictionary-learning 3DMM, 220 atoms
+neural3dmm     spiral autoencoder of the neutral face with the landmarks beside its code
+rbf            radial basis functions: no training at all
+still          the neutral face, unmoved
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from facejax.data.mesh_subset import Meshes
+from facejax.evaluation import vertex_error
+from facejax.geometry import rbf
+from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.mesh import rbf_weights
+from facejax.models.decoders import dictionary, gpmm, gpmm_residual, linear, s2d_dec
+from facejax.training.recipes import fit_gpmm, fit_neural3dmm, fit_residual, fit_s2d_dec
+
+
+class Options(NamedTuple):
+    """What a comparison holds fixed."""
+
+    by: str = "subjects"  # what will be new at test time, "subjects" or "labels": cross-validation holds it out
+    seed: int = 0
+    decoder: fit_s2d_dec.Plan = fit_s2d_dec.Plan()
+    residual: fit_residual.Plan = fit_residual.Plan()
+    neural3dmm: fit_neural3dmm.Plan = fit_neural3dmm.Plan()
+    components: int = gpmm.COMPONENTS
+    base: fit_gpmm.Fitted | None = None  # of the residual decoder, where it is known already
+    hierarchy: mesh_hierarchy.Hierarchy | None = None  # of the spiral networks; by default made of the mean face
+
+
+class Method(NamedTuple):
+    """A way from landmarks to a mesh."""
+
+    fit: Callable[[Meshes, Path, Options], Any]
+    apply: Callable[[Any, np.ndarray, np.ndarray], np.ndarray]  # displacements (T, L, 3), neutral (N, 3) -> (T, N, 3)
+
+
+class LinearFit(NamedTuple):
+    """A linear map, and the weight of its prior that cross-validation chose."""
+
+    params: linear.Params
+    alpha: float  # mm^2
+
+
+class Rest(NamedTuple):
+    """What methods that learn nothing know."""
+
+    faces: np.ndarray
+    landmark_index: np.ndarray
+
+
+def _hierarchy(train: Meshes, options: Options) -> mesh_hierarchy.Hierarchy:
+    if options.hierarchy is not None:
+        return options.hierarchy
+    template = np.asarray(train.data.neutral[train.subjects], np.float64).mean(axis=0)
+    return mesh_hierarchy.build(template, np.asarray(train.data.faces))
+
+
+def _linear(model: linear.Model, **fixed) -> Method:
+    def fit(train: Meshes, folder: Path, options: Options) -> LinearFit:
+        return LinearFit(*vertex_error.fit_linear(model, train, by=options.by, **fixed))
+
+    return Method(fit, _apply_linear)
+
+
+def _apply_linear(fitted: LinearFit, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + np.asarray(linear.apply(fitted.params, displacements))
+
+
+def _fit_dictionary(train: Meshes, folder: Path, options: Options) -> LinearFit:
+    index = np.asarray(train.data.landmark_index)
+    found = vertex_error.fit_linear(
+        dictionary.model, train, by=options.by, landmark_index=index, atoms=dictionary.ATOMS, seed=options.seed
+    )
+    return LinearFit(*found)
+
+
+class _Whole(NamedTuple):
+    """Meshes with their people's faces still in them, as displacements from the mean of all faces."""
+
+    meshes: Meshes
+
+    def __iter__(self):
+        rest, at = self.meshes.data.neutral, self.meshes.data.landmark_index
+        mean = np.asarray(rest[self.meshes.subjects]).mean(axis=0)
+        for low in range(0, self.meshes.count, self.meshes.size):
+            rows = np.arange(low, min(low + self.meshes.size, self.meshes.count))
+            off = self.meshes.read(rows)[1] + rest[self.meshes.owner[rows]] - mean
+            yield off[:, at], off
+
+
+def _fit_whole(train: Meshes, folder: Path, options: Options) -> LinearFit:
+    def prepare(batches, **_):
+        return linear.pca.prepare(_Whole(batches), components=220)
+
+    def solve(basis, *, alpha):
+        # The components move a face away from where it is, whatever the mean: displacements have no mean here.
+        at_rest = basis._replace(
+            landmark_mean=np.zeros_like(basis.landmark_mean), vertex_mean=np.zeros_like(basis.vertex_mean)
+        )
+        return linear.pca.solve(at_rest, alpha=alpha)
+
+    return LinearFit(*vertex_error.fit_linear(linear.model(prepare, solve), train, by=options.by))
+
+
+def _fit_s2d(train: Meshes, folder: Path, options: Options):
+    hierarchy = jax.device_put(_hierarchy(train, options))
+    return fit_s2d_dec.fit(train, hierarchy, folder, plan=options.decoder, seed=options.seed), hierarchy
+
+
+def _apply_s2d(fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    params, hierarchy = fitted
+    return neutral + np.asarray(s2d_dec.apply(params, hierarchy, np.asarray(displacements, np.float32)))
+
+
+def _fit_gpmm(train: Meshes, folder: Path, options: Options) -> fit_gpmm.Fitted:
+    return options.base or fit_gpmm.fit(train, by=options.by, components=options.components)
+
+
+def _apply_gpmm(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + np.asarray(linear.apply(gpmm.on_face(fitted.params, neutral), displacements))
+
+
+def _apply_doubting(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    params = gpmm.told(fitted.params, gpmm.noise_of(fitted.params, neutral, displacements))
+    return neutral + np.asarray(linear.apply(gpmm.on_face(params, neutral), displacements))
+
+
+def _fit_residual(train: Meshes, folder: Path, options: Options) -> gpmm_residual.Params:
+    return fit_residual.fit(
+        train, _hierarchy(train, options), folder, plan=options.residual, by=options.by, seed=options.seed,
+        base=_fit_gpmm(train, folder, options),
+    )  # fmt: skip
+
+
+def _apply_residual(fitted: gpmm_residual.Params, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + np.asarray(gpmm_residual.apply(fitted, displacements, neutral))
+
+
+def _fit_neural(train: Meshes, folder: Path, options: Options) -> fit_neural3dmm.Fitted:
+    return fit_neural3dmm.fit(train, _hierarchy(train, options), folder, plan=options.neural3dmm, seed=options.seed)
+
+
+def _apply_neural(fitted: fit_neural3dmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + fit_neural3dmm.apply(fitted, displacements, neutral)
+
+
+def _rest(train: Meshes, folder: Path, options: Options) -> Rest:
+    return Rest(np.asarray(train.data.faces), np.asarray(train.data.landmark_index))
+
+
+def _apply_rbf(known: Rest, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    points = np.asarray(neutral, np.float64)[known.landmark_index]
+    lips = rbf_weights.IBUG_LIPS if len(points) == 68 else None
+    weights = rbf_weights.weights(np.asarray(neutral, np.float64), known.faces, points, lips=lips)
+    return neutral + np.asarray(rbf.warp(weights, displacements))
+
+
+def _apply_still(known: Rest, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(neutral, (len(displacements), *np.shape(neutral)))
+
+
+METHODS = {
+    "s2d": Method(_fit_s2d, _apply_s2d),
+    "s2d_residual": Method(_fit_residual, _apply_residual),
+    "gpmm": Method(_fit_gpmm, _apply_gpmm),
+    "gpmm_found": Method(_fit_gpmm, _apply_doubting),
+    "ridge": _linear(linear.ridge),
+    "pca38": _linear(linear.pca, components=38),
+    "pca220": _linear(linear.pca, components=220),
+    "pca220_mean": Method(_fit_whole, _apply_linear),
+    "dl3dmm": Method(_fit_dictionary, _apply_linear),
+    "neural3dmm": Method(_fit_neural, _apply_neural),
+    "rbf": Method(_rest, _apply_rbf),
+    "still": Method(_rest, _apply_still),
+}

@@ -1,0 +1,115 @@
+"""Released weights: one safetensors file per tree of arrays, with a description of where it came from.
+
+A file holds raw arrays and a JSON header, and no code. Leaves are named by their path in the tree, such as
+`weights/blocks/0/kernel`. Loading needs a tree of the expected shapes (`jax.eval_shape` of an `init` gives
+one for free) and checks names, shapes and dtypes against it, so that a file of another model or version
+never loads in part.
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save as _serialise
+
+from facejax.io import atomic
+
+Tree = Any
+_HEADER = "facejax"
+_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jax.numpy.bfloat16)}
+_DTYPES |= {
+    f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}")
+    for kind in "fiu"
+    for size in (1, 2, 4, 8)
+    if kind + str(size) != "f1"
+}
+
+
+class WeightsError(atomic.FileError):
+    """A weights file that is missing, damaged, or made for another model."""
+
+
+def names(tree: Tree) -> dict[str, Any]:
+    """The leaves of a tree by name (`a/0/b`), in the order of `jax.tree.leaves`."""
+    leaves = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator="/")
+        if name in leaves:
+            raise ValueError(f"two leaves of the tree are both named {name!r}; rename a key that contains '/'")
+        leaves[name] = leaf
+    return leaves
+
+
+def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
+    """Write a tree of arrays and `metadata` (anything JSON holds) to a file that is replaced as a whole."""
+    path = Path(path)
+    arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
+    header = {_HEADER: json.dumps(metadata or {}, sort_keys=True)}
+    data = _serialise(arrays, metadata=header)
+    with atomic.replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
+    """Read (tree, metadata); `like` has the tree, shapes and dtypes to expect (arrays or `ShapeDtypeStruct`).
+
+    Leaves come back as numpy arrays. Raises `WeightsError` naming the file and every leaf that is missing,
+    unexpected, or of another shape or dtype.
+    """
+    with _open(path) as file:
+        metadata, expected = _metadata(path, file), names(like)
+        # Before any memory is taken for numbers.
+        stated = {name: _stated(file, name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        if wrong := mismatches(expected, stated):
+            raise WeightsError(f"{path} does not fit the model that asks for it: {'; '.join(wrong)}")
+        found = {name: file.get_tensor(name) for name in expected}
+    return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected]), metadata
+
+
+def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
+    """Read only the description that `save` was given, such as the configuration to build `like` from."""
+    with _open(path) as file:
+        return _metadata(path, file)
+
+
+def mismatches(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
+    """One line per leaf name that is missing, unexpected, or differs in shape or dtype; leaves have both."""
+    wrong = []
+    for name in expected.keys() | found.keys():
+        if name not in found:
+            wrong.append(f"{name} is missing")
+        elif name not in expected:
+            wrong.append(f"{name} is unexpected")
+        elif _describe(expected[name]) != _describe(found[name]):
+            wrong.append(f"{name} should be {_describe(expected[name])}, is {_describe(found[name])}")
+    return sorted(wrong)
+
+
+def _describe(leaf: Any) -> str:
+    return f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
+
+
+def _stated(file, name: str) -> Any:
+    """Shape and dtype of a tensor, as the header has them; a dtype that is unknown here is void."""
+    part = file.get_slice(name)
+    return jax.ShapeDtypeStruct(tuple(part.get_shape()), _DTYPES.get(part.get_dtype(), np.dtype("V1")))
+
+
+def _open(path: str | os.PathLike):
+    try:
+        return safe_open(path, framework="np")
+    except FileNotFoundError:
+        raise WeightsError(f"there is no weights file {path}") from None
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path} is not a whole safetensors file ({error}); fetch or write it anew") from error
+
+
+def _metadata(path: str | os.PathLike, file) -> dict[str, Any]:
+    try:
+        return json.loads((file.metadata() or {})[_HEADER])
+    except (KeyError, json.JSONDecodeError):
+        raise WeightsError(f"{path} is a safetensors file, but its header lacks the {_HEADER!r} entry") from None

@@ -1,0 +1,169 @@
+"""Motion3DGAN as its authors' program builds it: the SRVF as an image, 3L rows by T-1 columns.
+
+The published description (Otberdout et al. 2023, 3.1) leaves the layers out; these are the ones of the
+authors' 2022 program, with three changes: the last size is T-1 columns, the critic has no batch norm (which
+is unsound with a gradient penalty), and both networks know the log-length. The generator alone has 77 M
+weights at 19 labels; `width_divisor` makes all layers narrower.
+
+Same calls as `facejax.models.motion`: one sample, `start` and `end` label indices. Images are (rows, columns,
+channels); row 3 l + c is coordinate c of landmark l.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from facejax.geometry import sphere
+from facejax.models.motion.tangent_pca import Chart, Motion
+
+Weights = dict[str, Any]
+
+
+class Config(NamedTuple):
+    """Sizes, all static."""
+
+    steps: int = 29  # T - 1
+    landmarks: int = 68
+    labels: int = 19
+    noise: int = 128
+    width_divisor: int = 1
+
+
+DEFAULT = Config()
+
+
+class Params(NamedTuple):
+    """One network: the chart, of which it uses the point p and the log-lengths, and its weights."""
+
+    chart: Chart
+    weights: Weights
+
+
+class Network(NamedTuple):
+    """A pair of pure functions."""
+
+    init: Callable
+    apply: Callable
+
+
+def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+    stem_key, length_key, *conv_keys = jax.random.split(key, 6)
+    condition = 2 * config.labels
+    widths = [width // config.width_divisor for width in (1024, 512, 256, 128)] + [1]
+    rows, columns = _sizes(3 * config.landmarks, config.steps)[0]
+    # The labels enter twice: 128 + 2 x 36 = 200 inputs at the 18 labels of the original.
+    weights = {
+        "stem": _dense(stem_key, config.noise + 2 * condition, rows * columns * widths[0]),
+        "convs": [
+            _kernel(key, 3, inputs + condition, outputs)
+            for key, inputs, outputs in zip(conv_keys, widths[:-1], widths[1:], strict=True)
+        ],
+        "length": _dense(length_key, widths[3], 1),
+    }
+    return Params(chart, weights)
+
+
+@jax.jit
+def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, jax.Array]:
+    """Tangent vector at p (T-1, L, 3) and log-length () from noise (128,) ~ N(0, 1) and two label indices."""
+    chart, weights = jax.lax.stop_gradient(params.chart), params.weights
+    steps, landmarks, _ = chart.p.shape
+    condition = _one_hots(chart, start, end)
+    sizes = _sizes(3 * landmarks, steps)
+    stem = _linear(weights["stem"], jnp.concatenate([noise, condition, condition]))
+    image = jax.nn.relu(stem).reshape(*sizes[0], -1)
+    for kernel, size in zip(weights["convs"][:-1], sizes[1:], strict=True):
+        image = jax.image.resize(_tile(image, condition), (*size, kernel.shape[2]), "nearest")
+        image = jax.nn.relu(_convolve(image, kernel, stride=1))
+    standard = _linear(weights["length"], jnp.mean(image, (0, 1)))[0]
+    image = jnp.tanh(_convolve(_tile(image, condition), weights["convs"][-1], stride=1))
+    tangent = sphere.project(chart.p, image[..., 0].T.reshape(steps, landmarks, 3))
+    return tangent, chart.scalar_mean[start, end, 0] + chart.scalar_std[0] * standard
+
+
+def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+    *conv_keys, hidden_key, head_key = jax.random.split(key, 5)
+    condition = 2 * config.labels
+    widths = [width // config.width_divisor for width in (64, 32, 16)]
+    hidden = 1024 // config.width_divisor
+    halved = [-(-size // 8) for size in (3 * config.landmarks, config.steps)]  # three strides of two, padded
+    inputs = [1, *(width + condition for width in widths)]
+    weights = {
+        "convs": [_kernel(k, 5, i, o) for k, i, o in zip(conv_keys, inputs, widths, strict=False)],
+        "hidden": _dense(hidden_key, halved[0] * halved[1] * inputs[-1] + 1, hidden),
+        "head": _dense(head_key, hidden, 1),
+    }
+    return Params(chart, weights)
+
+
+@jax.jit
+def _criticise(params: Params, tangent: jax.Array, log_length: jax.Array, start, end) -> jax.Array:
+    """How real a tangent vector at p (T-1, L, 3) with a log-length () looks for two label indices."""
+    chart, weights = jax.lax.stop_gradient(params.chart), params.weights
+    condition = _one_hots(chart, start, end)
+    image = tangent.reshape(len(tangent), -1).T[..., None]
+    for kernel in weights["convs"]:
+        image = _tile(_leaky(_convolve(image, kernel, stride=2)), condition)
+    standard = (log_length - chart.scalar_mean[start, end, 0]) / chart.scalar_std[0]
+    hidden = _leaky(_linear(weights["hidden"], jnp.append(jnp.ravel(image), standard)))
+    return _linear(weights["head"], hidden)[0]
+
+
+generator = Network(_init_generator, _generate)
+critic = Network(_init_critic, _criticise)
+
+
+@jax.jit
+def sample(params: Params, key: jax.Array, start, end, pose: jax.Array | None = None) -> Motion:
+    """Draw a motion between two labels. The pose is not heeded, and the duration is the pair's mean."""
+    del pose
+    noise = jax.random.normal(key, (_noise(params),))
+    tangent, log_length = generator.apply(params, noise, start, end)
+    return Motion(sphere.exp(params.chart.p, tangent), log_length, params.chart.scalar_mean[start, end, 1])
+
+
+def _noise(params: Params) -> int:
+    """The labels enter the first layer twice, as two one-hots each."""
+    return params.weights["stem"]["kernel"].shape[0] - 4 * len(params.chart.scalar_mean)
+
+
+def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Image sizes from coarse to fine: 51 x 7, 102 x 14, 204 x 28, 204 x 29 for 68 landmarks and 29 steps."""
+    low, short = -(-rows // 4), max(columns // 4, 1)
+    return [(low, short), (2 * low, 2 * short), (rows, 4 * short), (rows, columns)]
+
+
+def _one_hots(chart: Chart, start, end) -> jax.Array:
+    labels = len(chart.scalar_mean)
+    return jnp.concatenate([jax.nn.one_hot(start, labels), jax.nn.one_hot(end, labels)])
+
+
+def _tile(image: jax.Array, condition: jax.Array) -> jax.Array:
+    return jnp.concatenate([image, jnp.broadcast_to(condition, (*image.shape[:2], len(condition)))], axis=-1)
+
+
+def _leaky(x: jax.Array) -> jax.Array:
+    return jax.nn.leaky_relu(x, 0.2)
+
+
+def _convolve(image: jax.Array, kernel: jax.Array, *, stride: int) -> jax.Array:
+    layout = ("NHWC", "HWIO", "NHWC")
+    strides = (stride, stride)
+    return jax.lax.conv_general_dilated(image[None], kernel, strides, "SAME", dimension_numbers=layout)[0]
+
+
+def _kernel(key: jax.Array, size: int, inputs: int, outputs: int) -> jax.Array:
+    return jax.nn.initializers.he_normal()(key, (size, size, inputs, outputs))
+
+
+def _dense(key: jax.Array, inputs: int, outputs: int) -> Weights:
+    return {
+        "kernel": jax.nn.initializers.he_normal()(key, (inputs, outputs)),
+        "bias": jnp.zeros(outputs),
+    }
+
+
+def _linear(layer: Weights, x: jax.Array) -> jax.Array:
+    return x @ layer["kernel"] + layer["bias"]

@@ -1,0 +1,105 @@
+"""Everything that `facejax generate` needs, trained on one dataset: a store in, models out.
+
+The generator of motion (`facejax.fit_motion`), the peaks that it starts from, and the way from landmarks to meshes
+(`facejax.fit_residual`). The dataset has to hold recordings that go from neutral to an expression and back. Each stage
+keeps checkpoints in its folder and goes on from there when called again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jax.sharding import Mesh
+
+from facejax.data import dataset, mesh_subset, motions, transitions
+from facejax.data.synthetic import makehuman
+from facejax.evaluation import vertex_error
+from facejax.inference import pipeline
+from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.mesh import rbf_weights
+from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual
+from facejax.viz import eyes_teeth
+
+FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
+
+
+class Plans(NamedTuple):
+    """How the two networks are trained."""
+
+    motion: fit_motion.FlowPlan = fit_motion.FlowPlan()
+    residual: fit_residual.Plan = fit_residual.Plan()
+
+
+def fit(
+    data: dataset.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
+) -> pipeline.Models:
+    """Train on the training subjects of a store; `mesh` as in `training.run`.
+
+    Raises `ValueError` where the store holds too little to learn from.
+    """
+    check(data)
+    mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
+    faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
+    hierarchy = mesh_hierarchy.build(mean, faces)
+    known = motions.join(*transitions.everything(data, "train", names=data.labels, per_pair=transitions.CHARTED))
+    chart = transitions.chart_of(known, labels=len(data.labels), rank=transitions.rank_of(known))
+    examples = transitions.examples_of(
+        chart, transitions.everything(data, "train", names=data.labels, per_pair=transitions.SPREAD)
+    )
+    generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed, mesh=mesh)
+    beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
+    train = mesh_subset.of_split(data, "train")
+    # As many components as the file will hold: the network refines the very answer that it will meet.
+    base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
+    expander = fit_residual.fit(
+        train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, mesh=mesh
+    )
+    return pipeline.Models(
+        labels=data.labels,
+        face=pipeline.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.region(mean, faces, at)),
+        props=props(),
+        motion=generator,
+        starts=beginnings,
+        hierarchy=hierarchy,
+        decoder=expander,
+        about={"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
+        | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}},
+    )
+
+
+def check(data: dataset.Store) -> None:
+    """Raise `ValueError` for a dataset that nothing can be learnt from, with what it lacks."""
+    people = data.subjects("train")
+    if len(data.vertices) == 0:
+        raise ValueError(f"{data.path}: holds landmarks alone, expected meshes; `facejax.fit_motion` fits their motion")
+    if len(people) < FEWEST:
+        raise ValueError(f"{data.path}: {len(people)} training subjects, expected {FEWEST} or more")
+    named = {s.label for s in data.sequences if s.subject in set(people.tolist()) and ">" not in s.label}
+    lacking = [label for label in data.labels[1:] if label not in named]
+    if lacking or len(data.labels) < 3:
+        raise ValueError(
+            f"{data.path}: expected training recordings of two or more expressions, and of every label; got "
+            f"{len(named)}" + (f", none of {', '.join(lacking)}" if lacking else "")
+        )
+
+
+def judge(models: pipeline.Models, data: dataset.Store, *splits: str) -> dict[str, float]:
+    """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
+    held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
+    if not held:
+        return {}
+    regions = {"head": np.ones(len(models.face.vertices), bool), "face": np.asarray(models.face.mask)}
+    at = models.face.landmark_index
+    found = vertex_error.distances(
+        lambda marks, rest: np.asarray(pipeline.meshes(models, rest[at] + marks, rest)),
+        mesh_subset.of_split(data, *held), regions,
+    )  # fmt: skip
+    return {name: found.mean_std(mask)[0] for name, mask in regions.items()}
+
+
+def props() -> eyes_teeth.Props:
+    """The template's eyes and teeth, for pictures of faces that came without; used where there are 68 landmarks."""
+    shape = makehuman.template()
+    return eyes_teeth.Props(shape.vertices[shape.landmarks], *makehuman.template_props())

@@ -1,0 +1,259 @@
+"""Training generators of motion: a dataset in, parameters out.
+
+Three of one interface: the GAN sized for a CPU, the GAN as its authors built it, and the flow. All learn from the same
+motions; each run keeps metrics and checkpoints in a folder and goes on from there when called again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from facejax import losses
+from facejax.data import motions, transitions
+from facejax.geometry import sphere, srvf
+from facejax.models.motion import flow_matching, motion3dgan, motion3dgan_reference, tangent_pca
+from facejax.training import loop, metric_logger, steps
+
+
+class GanPlan(NamedTuple):
+    """How Motion3DGAN is trained; OT23's figures where it gives them."""
+
+    steps: int = 8_000
+    batch: int = 128
+    critic_steps: int = 4
+    rate: float = 5e-4  # decays along a cosine, to 5 %
+    penalty: float = 10.0
+    reconstruction: float = 0.0  # alpha_2 of OT23 (10 there): it narrows the spread within a label pair
+    length: float = 0.0  # weight of |log-length error|, which goes with it
+    geodesic: float = 0.0  # weight of the geodesic distance, which the authors' program adds (10 there)
+    decay: float = 0.999  # of the generator's moving average
+
+
+# The authors' GAN with OT23's own weights and rate.
+REFERENCE = GanPlan(steps=2_000, rate=1e-4, reconstruction=10.0, length=10.0)
+
+
+class FlowPlan(NamedTuple):
+    """How the flow is trained."""
+
+    steps: int = 12_000
+    batch: int = 256
+    rate: float = 1e-3  # decays along a cosine, to zero
+    weight_decay: float = 1e-4
+    whitening: float = 0.5  # 0: errors count as they are on the sphere; 1: in units of each direction's deviation
+    decay: float = 0.999  # of the moving average
+
+
+def fit_gan(
+    examples: transitions.Examples,
+    chart: tangent_pca.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: GanPlan = GanPlan(),
+    config: motion3dgan.Config = motion3dgan.Config(),
+    seed: int = 0,
+    average: bool = True,
+    mesh: Mesh | None = None,
+) -> motion3dgan.Params:
+    """Train the generator against its critic; returns its moving average, or with `average` off its last state.
+
+    Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
+    and another plan in it is refused. With a `mesh` each batch is shared out, see `training.run`.
+    """
+    config = sized(config, chart)
+    _claim(folder, "gan", plan, config, seed, examples.values)
+    generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
+    players = steps.Players(
+        motion3dgan.generator.init(generator_key, chart, config=config).weights,
+        motion3dgan.critic.init(critic_key, chart, config=config).weights,
+    )
+    optimisers = steps.Players(
+        *(
+            optax.adam(optax.cosine_decay_schedule(plan.rate, plan.steps * count, alpha=0.05), 0.5, 0.9)
+            for count in (1, plan.critic_steps)
+        )
+    )
+    step = steps.adversarial(
+        lambda weights, chart, key, condition: motion3dgan.generator.inner(
+            motion3dgan.Params(chart, weights), jax.random.normal(key, (config.noise,)), *condition
+        ),
+        lambda weights, chart, values, condition: motion3dgan.critic.inner(
+            motion3dgan.Params(chart, weights), values, *condition
+        ),
+        optimisers,
+        critic_steps=plan.critic_steps,
+        penalty=plan.penalty,
+        terms=_terms(plan) if plan.reconstruction or plan.length or plan.geodesic else None,
+        decay=plan.decay,
+    )
+    state = steps.start_adversarial(players, optimisers, play_key)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed, mesh)
+    return motion3dgan.Params(chart, state.extra if average else state.params.generator)
+
+
+def fit_flow(
+    examples: transitions.Examples,
+    chart: tangent_pca.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: FlowPlan = FlowPlan(),
+    config: flow_matching.Config = flow_matching.Config(),
+    seed: int = 0,
+    mesh: Mesh | None = None,
+) -> flow_matching.Params:
+    """Train a velocity field; returns its moving average. Chart, config, folder and mesh as in `fit_gan`.
+
+    Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
+    exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
+    """
+    config = sized(config, chart)
+    _claim(folder, "flow", plan, config, seed, examples.values)
+    init_key, run_key = jax.random.split(jax.random.key(seed))
+    weights = flow_matching.init(init_key, chart, config=config).weights
+
+    def loss(weights, key, batch, chart):
+        values, condition = batch
+        source_key, time_key = jax.random.split(key)
+        keys = jax.random.split(source_key, len(values))
+        source = jax.vmap(flow_matching.source, (None, 0, 0, 0, 0))(chart, keys, *condition)
+        target = jax.vmap(flow_matching.wrap, (None, 0))(chart, values)
+        unit = jax.vmap(flow_matching.unit, (None, 0, 0))(chart, *condition[:2])
+        # Of one size in the mean, whatever the power: the two scalars keep their weight.
+        size = jnp.sqrt(jnp.mean(unit ** (2 - 2 * plan.whitening), axis=1, keepdims=True))
+        unit = size * unit**plan.whitening
+        params = flow_matching.Params(chart, weights)
+
+        def field(state, time, condition):
+            return flow_matching.velocity(params, state, time, *condition)
+
+        return losses.flow_matching(field, time_key, source, target, condition, unit), {}
+
+    optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
+    step = steps.averaged(steps.supervised(loss, optimiser), plan.decay)
+    state = steps.start_supervised(weights, optimiser, run_key)._replace(extra=weights)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed, mesh)
+    return flow_matching.Params(chart, state.extra)
+
+
+def fit_reference(
+    known: motions.Motions,
+    chart: tangent_pca.Chart,
+    folder: str | os.PathLike,
+    *,
+    plan: GanPlan = REFERENCE,
+    config: motion3dgan_reference.Config = motion3dgan_reference.Config(),
+    seed: int = 0,
+    mesh: Mesh | None = None,
+) -> motion3dgan_reference.Params:
+    """Train the GAN as its authors built it, on whole tangent vectors; returns the generator's moving average."""
+    _, steps_, landmarks, _ = chart.basis.shape
+    config = config._replace(steps=steps_, landmarks=landmarks, labels=len(chart.mean))
+    q, log_length = srvf.encode(jnp.asarray(known.curves))
+    pair = jnp.asarray(known.start), jnp.asarray(known.end)
+    standard = (log_length - chart.scalar_mean[*pair, 0]) / chart.scalar_std[0]
+    real = {"tangent": sphere.log(chart.p, q), "length": standard}
+    _claim(folder, "reference", plan, config, seed, np.asarray(known.curves))
+    generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
+    players = steps.Players(
+        motion3dgan_reference.generator.init(generator_key, chart, config=config).weights,
+        motion3dgan_reference.critic.init(critic_key, chart, config=config).weights,
+    )
+    optimisers = steps.Players(optax.adam(plan.rate, 0.5, 0.9), optax.adam(plan.rate, 0.5, 0.9))
+
+    def scalars(chart, pair):
+        return chart.scalar_mean[*pair, 0], chart.scalar_std[0]
+
+    def generate(weights, chart, key, pair):
+        params = motion3dgan_reference.Params(chart, weights)
+        tangent, log_length = motion3dgan_reference.generator.apply(
+            params, jax.random.normal(key, (config.noise,)), *pair
+        )
+        # The critic sees what log_p makes of exp_p: the same vector, but for angles beyond pi.
+        tangent = sphere.log(chart.p, sphere.exp(chart.p, tangent))
+        mean, deviation = scalars(chart, pair)
+        return {"tangent": tangent, "length": (log_length - mean) / deviation}
+
+    def score(weights, chart, sample, pair):
+        mean, deviation = scalars(chart, pair)
+        params = motion3dgan_reference.Params(chart, weights)
+        return motion3dgan_reference.critic.apply(params, sample["tangent"], mean + deviation * sample["length"], *pair)
+
+    def terms(chart, fake, real, pair):
+        length = chart.scalar_std[0] * losses.tangent_l1(fake["length"], real["length"])
+        return {
+            "reconstruction": plan.reconstruction * losses.tangent_l1(fake["tangent"], real["tangent"]),
+            "length": plan.length * length,
+        }
+
+    step = steps.adversarial(
+        generate, score, optimisers, critic_steps=plan.critic_steps, penalty=plan.penalty, terms=terms, decay=plan.decay
+    )
+    state = loop.run(
+        loop.gathered(step),
+        steps.start_adversarial(players, optimisers, play_key),
+        loop.epoch_indices(seed, len(known.curves), plan.batch * plan.critic_steps),
+        folder,
+        steps=plan.steps,
+        constants=((real, pair), chart),
+        chunk=1,
+        save_seconds=120.0,
+        mesh=mesh,
+    )
+    return motion3dgan_reference.Params(chart, state.extra)
+
+
+def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, mesh):
+    rows = transitions.balanced(examples.start, examples.end, seed)
+    order = loop.epoch_indices(seed, len(rows), batch)
+    conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
+    held = (jnp.asarray(examples.values), conditions), chart
+    return loop.run(
+        loop.gathered(step),
+        state,
+        lambda first, count: rows[order(first, count)],
+        folder,
+        steps=count,
+        constants=held,
+        mesh=mesh,
+    )
+
+
+def sized(config, chart: tangent_pca.Chart):
+    """A network's config with the sizes that the chart knows."""
+    (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
+    return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
+
+
+def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> None:
+    if plan.steps < 1:
+        raise ValueError(f"plan: expected 1 step or more, got {plan.steps}")
+    digest = hashlib.sha256(np.ascontiguousarray(known)).hexdigest()
+    record = {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest, "kind": kind}
+    metric_logger.claim(folder, record)
+
+
+def _terms(plan: GanPlan):
+    def terms(chart, fake, real, condition):
+        # Equation 6 on tangent vectors; the coordinates expand linearly, so their difference does.
+        difference = jnp.tensordot((fake - real)[:, tangent_pca.SCALARS :], chart.basis, 1)
+        scalars = chart.scalar_std * jnp.mean(jnp.abs((fake - real)[:, : tangent_pca.SCALARS]), axis=0)
+        return {
+            "reconstruction": plan.reconstruction * jnp.mean(jnp.abs(difference)),
+            "length": plan.length * jnp.sum(scalars),
+            "geodesic": plan.geodesic * jnp.mean(_distances(chart, fake, real)),
+        }
+
+    return terms
+
+
+def _distances(chart: tangent_pca.Chart, fake: jax.Array, real: jax.Array) -> jax.Array:
+    fake, real = (jax.vmap(flow_matching.wrap, (None, 0))(chart, values)[0] for values in (fake, real))
+    return sphere.distance(fake, real)

@@ -1,0 +1,149 @@
+"""Training the decoder of residuals on top of the best linear answer.
+
+The morphable model is chosen and fitted first (`facejax.fit_gpmm`). The network is trained on what its cross-validated
+answers leave over, which is what it will meet on new faces; a fourth of the people (or labels) is kept to choose the
+gate. A run goes on from its checkpoints; a finished one is read from `network.safetensors`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from facejax.data.mesh_subset import Meshes
+from facejax.io import weights
+from facejax.mesh import strain
+from facejax.mesh.hierarchy import Hierarchy
+from facejax.models.decoders import gpmm, gpmm_residual, residual
+from facejax.training import loop, metric_logger, sharding, steps
+from facejax.training.recipes import fit_gpmm
+
+GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
+WORTH = 0.995  # a gate that is not 0 has to be better by half a hundredth
+
+
+class Plan(NamedTuple):
+    """How the network is trained."""
+
+    steps: int = 2_500
+    batch: int = 16
+    rate: float = 2e-3  # decays to zero along a cosine
+    weight_decay: float = 1e-4
+    # Of the unit: below it the loss is squared. Wrinkles are sparse, and an absolute loss predicts none.
+    soft: float = 0.1
+
+
+def fit(
+    train: Meshes,
+    hierarchy: Hierarchy,
+    folder: str | os.PathLike,
+    *,
+    plan: Plan = Plan(),
+    by: str = "subjects",
+    seed: int = 0,
+    base: fit_gpmm.Fitted | None = None,
+    mesh: Mesh | None = None,
+) -> gpmm_residual.Params:
+    """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit.
+
+    `mesh` as in `training.run`.
+    """
+    folder, data = Path(folder), train.data
+    chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
+    base = base or fit_gpmm.fit(train, by=by)
+    claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
+    metric_logger.claim(folder, claim | {"base": base.params.prior._asdict()})
+    tables = jax.device_put(strain.around(np.asarray(data.faces), len(base.params.face)))
+    hierarchy = jax.device_put(hierarchy)
+    done = folder / "network.safetensors"
+    if done.exists():
+        return gpmm_residual.Params(
+            base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables
+        )
+    answers = base.held_out(train)
+    *_, (_, kept) = base.folds
+    seen = np.setdiff1d(np.arange(train.count), kept)
+    scale = _measure(train.where(np.isin(np.arange(train.count), seen)), answers[seen], base.params.face)
+    init_key, run_key = jax.random.split(jax.random.key(seed))
+    params = residual.init(init_key, hierarchy, scale)
+
+    def loss(trained, key, batch, constants):
+        scale, hierarchy, tables, neutrals = constants
+        marks, start, target, owner = batch
+        found = residual.apply(
+            residual.Params(scale, trained, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
+        )
+        squared = jnp.sum(jnp.square((found - target) / scale.unit), axis=-1)
+        # Charbonnier: a distance, squared near zero.
+        value = jnp.mean(jnp.sqrt(squared + plan.soft**2))
+        return value, {"error_mm": scale.unit * jnp.mean(jnp.sqrt(squared))}
+
+    optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
+    indices = loop.epoch_indices(seed, len(seen), plan.batch)
+
+    def batches(first: int, count: int):
+        rows = seen[indices(first, count).ravel()]
+        found = (*train.read(rows), answers[rows], train.owner[rows])
+        marks, target, start, owner = (x.reshape(count, plan.batch, *x.shape[1:]) for x in found)
+        return marks, start, target, owner
+
+    state = loop.run(
+        steps.supervised(loss, optimiser),
+        steps.start_supervised(params.weights, optimiser, run_key),
+        batches,
+        folder,
+        steps=plan.steps,
+        constants=(scale, hierarchy, tables, jnp.asarray(data.neutral)),
+        chunk=25,
+        mesh=mesh,
+    )
+    network = residual.Params(scale, state.params, jnp.ones(()))
+    fitted = gpmm_residual.Params(base.params, network, hierarchy, tables)
+    network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
+    # What was judged is kept: the answers that it was judged by take a minute to come by.
+    if sharding.is_first():
+        weights.save(done, network._asdict())
+    sharding.meet("the network is written")
+    return fitted._replace(network=network)
+
+
+def _load(path: Path, hierarchy: Hierarchy, base: gpmm.Params, landmarks: int) -> residual.Params:
+    blank = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.ones(()))
+    like = jax.eval_shape(lambda key: residual.init(key, hierarchy, blank), jax.random.key(0))
+    return residual.Params(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
+
+
+def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
+    sums, squares, left, count = 0.0, 0.0, 0.0, 0
+    for marks, vertices in train:
+        left += np.sum(np.square(vertices - answers[count : count + len(vertices)], dtype=np.float64))
+        count += len(marks)
+        sums, squares = sums + marks.sum(axis=0, dtype=np.float64), squares + np.sum(np.square(marks, dtype=np.float64))
+    mean = sums / count
+    deviation = np.sqrt(max(squares / (count * mean.size) - np.mean(mean**2), 1e-12))
+    unit = max(np.sqrt(left / (count * face.size)), 1e-6)
+    return residual.Scale(*(jnp.asarray(x, jnp.float32) for x in (face, mean, deviation, unit)))
+
+
+def _gate(fitted: gpmm_residual.Params, train: Meshes, answers: np.ndarray, kept: np.ndarray) -> float:
+    """The share of the network's answer with the least error on meshes that it was not trained on."""
+    errors, count = np.zeros(len(GATES)), 0
+    for low in range(0, len(kept), 256):
+        rows = kept[low : low + 256 : 2]
+        marks, vertices = train.read(rows)
+        base = answers[rows]
+        rest = np.asarray(train.data.neutral)[train.owner[rows]]
+        whole = np.asarray(gpmm_residual.refine(fitted, marks, base, rest)) - base
+        left = vertices - base
+        errors += [np.linalg.norm(left - gate * whole, axis=-1).mean(axis=-1).sum() for gate in GATES]
+        count += len(rows)
+    best = int(np.argmin(errors))
+    return GATES[best] if errors[best] < WORTH * errors[0] else 0.0

@@ -1,0 +1,106 @@
+"""Training S2D-Dec: meshes in, parameters out.
+
+A run keeps metrics and checkpoints in a folder and goes on from there when called again. The generator of motion is
+trained apart (`facejax.fit_motion`), as OT23 4.1 does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh
+
+from facejax import losses
+from facejax.data.mesh_subset import Meshes
+from facejax.mesh.hierarchy import Hierarchy
+from facejax.models.decoders import s2d_dec
+from facejax.training import loop, metric_logger, steps
+
+
+class Plan(NamedTuple):
+    """How S2D-Dec is trained."""
+
+    steps: int = 12_000
+    batch: int = 16
+    rate: float = 1e-3  # decays to zero along a cosine (OT23: x 0.99 per epoch, for 300 epochs)
+    weight_decay: float = 5e-5
+    beta1: float = 1.0
+    beta2: float = 0.1
+    reduction: str = "paper"
+    weighting: str = "linear"
+
+
+def fit(
+    meshes: Meshes,
+    hierarchy: Hierarchy,
+    folder: str | os.PathLike,
+    *,
+    plan: Plan = Plan(),
+    seed: int = 0,
+    mesh: Mesh | None = None,
+) -> s2d_dec.Params:
+    """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole.
+
+    `mesh` as in `training.run`.
+    """
+    data = meshes.data
+    chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
+    metric_logger.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
+    weights = vertex_weights(meshes, plan.weighting)
+    init_key, run_key = jax.random.split(jax.random.key(seed))
+    scale = s2d_dec.measure(meshes)
+    params = s2d_dec.init(init_key, hierarchy, landmarks=len(data.landmark_index), scale=scale)
+
+    def loss(trained, key, batch, constants):
+        scale, hierarchy, weights = constants
+        marks, target = batch
+        predicted = s2d_dec.apply(s2d_dec.Params(scale, trained), hierarchy, marks)
+        value = losses.s2d(predicted, target, weights, beta1=plan.beta1, beta2=plan.beta2, reduction=plan.reduction)
+        # The distance is for the journal alone: its gradient at a vertex that is met exactly would be NaN.
+        distance = jnp.linalg.norm(jax.lax.stop_gradient(predicted - target), axis=-1)
+        return value, {"error_mm": jnp.mean(distance)}
+
+    optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
+    state = loop.run(
+        steps.supervised(loss, optimiser),
+        steps.start_supervised(params.weights, optimiser, run_key),
+        mesh_batches(meshes, plan.batch, seed),
+        folder,
+        steps=plan.steps,
+        constants=(scale, jax.device_put(hierarchy), weights),
+        chunk=50,
+        mesh=mesh,
+    )
+    return s2d_dec.Params(scale, state.params)
+
+
+def vertex_weights(meshes: Meshes, weighting: str) -> jax.Array:
+    """`losses.landmark_weights` (N,) on the mean neutral face of the meshes' subjects."""
+    template = np.asarray(meshes.data.neutral[meshes.subjects], np.float64).mean(axis=0)
+    return losses.landmark_weights(
+        jnp.asarray(template, jnp.float32), jnp.asarray(meshes.data.landmark_index), mode=weighting,
+        edge_length=_edge_length(template, meshes.data.faces),
+    )  # fmt: skip
+
+
+def mesh_batches(meshes: Meshes, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
+    """`batches(first, count)`: landmarks (count, B, L, 3) and vertices (count, B, N, 3), read as they are needed."""
+    indices = loop.epoch_indices(seed, meshes.count, batch)
+
+    def batches(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+        found = meshes.read(indices(first, count).ravel())
+        return tuple(x.reshape(count, batch, *x.shape[1:]) for x in found)
+
+    return batches
+
+
+def _edge_length(vertices: np.ndarray, faces: np.ndarray) -> float:
+    ends = vertices[np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
