@@ -202,7 +202,7 @@ def _picture(out: Path, models: pipeline.Models, labels, seed: int) -> None:
     face = models.face
     marks = pipeline.landmarks(models, jax.random.key(seed), labels, face.vertices)
     vertices = np.asarray(pipeline.meshes(models, marks[:: FRAMES - 1], face.vertices))
-    parts = eyes_teeth.parts(models.props, np.asarray(marks[0]), np.asarray(marks[:: FRAMES - 1]))
+    parts = eyes_teeth.parts(eyes_teeth.template(), np.asarray(marks[0]), np.asarray(marks[:: FRAMES - 1]))
     pictures = render.frames(vertices, face.faces, size=(160, 200), extras=parts)
     pictures = contact_sheet.caption(pictures, tuple((i, name.replace("_", " ")) for i, name in enumerate(labels)))
     rows = [pictures[:7], pictures[7:14], pictures[14:]]

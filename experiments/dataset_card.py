@@ -28,6 +28,7 @@ from facejax.evaluation import vertex_error
 from facejax.inference import makehuman_portrait
 from facejax.io import atomic
 from facejax.models.decoders import linear
+from facejax.training.recipes import fit_linear
 from facejax.viz import render
 
 matplotlib.use("Agg")
@@ -112,7 +113,7 @@ def _linear_errors(data: dataset.Store) -> dict[str, Any]:
         rows: dict[str, list] = {"ridge": [], "pca220": []}
         for fit_on, judge_on in folds:
             for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
-                params, _ = vertex_error.fit_linear(model, fit_on, **options)
+                params, _ = fit_linear.fit_linear(model, fit_on, **options)
                 rows[name].append(vertex_error.vertex_errors(lambda m, p=params: linear.apply(p, m), judge_on, regions))
         found[split] = {
             name: {region: float(np.mean([row[region]["mean_mm"] for row in of])) for region in regions}

@@ -26,7 +26,7 @@ from experiments import _cases, _run, _scored
 from facejax.cli import runtime
 from facejax.data import dataset, sequences
 from facejax.data.synthetic import makehuman4d, performance
-from facejax.evaluation import vertex_error
+from facejax.evaluation import expression_error
 from facejax.inference import expressions
 from facejax.io import atomic
 from facejax.models import expression_lstm
@@ -207,7 +207,7 @@ def scores(
         number = data.labels.index(label)
         parts = (held_out.take(held_out.label == number), train.take(train.label == number))
         network, start = fit_expression_lstm.network(params, i), variant.config.start
-        found[label] = vertex_error.expression_scores(network, *parts, start=start, prefix=_scored.PREFIX)
+        found[label] = expression_error.expression_scores(network, *parts, start=start, prefix=_scored.PREFIX)
     return found
 
 

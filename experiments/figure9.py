@@ -95,7 +95,7 @@ def run(config: Config) -> dict[str, Any]:
     outputs.writable(config.out)
     rows = []
     for name, (take, vertices, marks) in films.items():
-        extras = eyes_teeth.parts(models.props, take.rest[index], marks)
+        extras = eyes_teeth.parts(eyes_teeth.template(), take.rest[index], marks)
         io.save(config.out / f"{name}.glb", vertices, models.face.faces, extras=extras)
         rows.append(_pictures(models, take.rest, vertices, extras))
     path = config.out / "figure9.png"

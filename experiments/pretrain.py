@@ -25,14 +25,16 @@ from experiments import _run
 from facejax.data import dataset, motions, transitions
 from facejax.data.mesh_subset import of_split
 from facejax.data.synthetic import assets, makehuman, makehuman4d, performance
+from facejax.evaluation import vertex_error
 from facejax.inference import pipeline
 from facejax.io import cache
 from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.models import bundle
 from facejax.models.decoders import s2d_dec
 from facejax.models.motion import generators
-from facejax.training.recipes import fit_bundle, fit_gpmm, fit_motion, fit_residual, fit_s2d_dec
+from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual, fit_s2d_dec
 
-PACKAGED = Path(pipeline.__file__).parent / "assets" / pipeline.RELEASED
+PACKAGED = Path(pipeline.__file__).parent / "assets" / bundle.RELEASED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Config:
     """Which generator of motion."""
     motion_steps: int | None = None
     """Generator steps; by default those of its plan."""
-    meshes_by: Literal["refined", "s2d"] = pipeline.REFINED
+    meshes_by: Literal["refined", "s2d"] = bundle.REFINED
     """Way from landmarks to meshes: the best linear answer refined, or S2D-Dec."""
     decoder_steps: int | None = None
     """Steps of its network; by default those of its plan."""
@@ -96,7 +98,6 @@ def run(config: Config) -> dict[str, Any]:
             assets.load().source_index[: len(shape.vertices)],
             shape.face_mask,
         ),
-        props=fit_bundle.props(),
         motion=generator,
         starts=beginnings,
         hierarchy=hierarchy,
@@ -104,17 +105,17 @@ def run(config: Config) -> dict[str, Any]:
         about={"made": made, "plans": {"motion": _motion_about(config), "decoder": _decoder_about(config)}},
     )
     # Judged as the file holds them: rounded.
-    pipeline.save(config.out / pipeline.RELEASED, models)
-    models = pipeline.load(config.out / pipeline.RELEASED)
+    pipeline.save(config.out / bundle.RELEASED, models)
+    models = pipeline.load(config.out / bundle.RELEASED)
     metrics = {
-        "error_mm": fit_bundle.judge(models, data, "test"),
+        "error_mm": vertex_error.of_models(models, data, "test"),
         "seconds": {"motion": motion_seconds, "decoder": decoder_seconds},
     }
     models = models._replace(about=models.about | metrics)
-    pipeline.save(config.out / pipeline.RELEASED, models)
+    pipeline.save(config.out / bundle.RELEASED, models)
     if config.release:
         pipeline.save(PACKAGED, models)
-    size = (config.out / pipeline.RELEASED).stat().st_size / 1e6
+    size = (config.out / bundle.RELEASED).stat().st_size / 1e6
     rows = [
         ("landmarks to mesh", "S2D-Dec" if isinstance(decode, s2d_dec.Params) else "carried GPMM, refined"),
         ("mean vertex error on test subjects, whole head", f"{metrics['error_mm']['head']:.4f} mm"),
@@ -145,7 +146,7 @@ def _taken(path: Path, network: str) -> dict[str, Any]:
 
 
 def _plan(config: Config) -> fit_s2d_dec.Plan | fit_residual.Plan:
-    plan = fit_s2d_dec.Plan() if config.meshes_by == pipeline.S2D else fit_residual.Plan()
+    plan = fit_s2d_dec.Plan() if config.meshes_by == bundle.S2D else fit_residual.Plan()
     return plan if config.decoder_steps is None else plan._replace(steps=config.decoder_steps)
 
 
@@ -191,10 +192,10 @@ def _decoder(config: Config, data: dataset.Store, hierarchy):
         return pipeline.load(config.decoder).decoder, 0.0
     folder, train = config.out / config.meshes_by, of_split(data, "train")
     with _timed(folder) as seconds:
-        if config.meshes_by == pipeline.S2D:
+        if config.meshes_by == bundle.S2D:
             found = fit_s2d_dec.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed)
         else:
-            base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
+            base = fit_gpmm.fit(train, components=bundle.COMPONENTS)
             found = fit_residual.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed, base=base)
     return found, seconds()
 

@@ -26,7 +26,7 @@ from facejax.data.synthetic import makehuman4d, rig
 from facejax.evaluation import vertex_error
 from facejax.models.decoders import linear, s2d_dec
 from facejax.training import metric_logger
-from facejax.training.recipes import fit_s2d_dec
+from facejax.training.recipes import fit_linear, fit_s2d_dec
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -65,7 +65,7 @@ def run(config: Config) -> dict[str, Any]:
         train, test = of_split(data, "train"), of_split(data, "test")
         regions = _cases.regions_of(data)
         for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
-            params, alpha = vertex_error.fit_linear(model, train, **options)
+            params, alpha = fit_linear.fit_linear(model, train, **options)
             found = vertex_error.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
             rows += _rows(level, name, found, {"alpha_mm2": alpha})
         decode, training = _decoder(config, level, train)

@@ -220,7 +220,7 @@ def _filmed(config: Config, models: pipeline.Models, item: Item, motion: Motion)
     size = (config.width, config.width * 5 // 4)
     pictures = render.frames(
         motion.vertices, models.face.faces, size=size, camera=render.aim(motion.vertices, size=size, turn=TURN),
-        extras=eyes_teeth.parts(models.props, rest, motion.landmarks),
+        extras=eyes_teeth.parts(eyes_teeth.template(), rest, motion.landmarks),
     )  # fmt: skip
     texts = [f"{a} → {b}".replace("_", " ") for a, b in itertools.pairwise(item.labels)]
     pictures = render.caption(pictures, tuple(zip(motion.starts, texts, strict=True)))

@@ -13,7 +13,6 @@ import trimesh
 from facejax.data.synthetic import makehuman, makehuman4d
 from tests import balls
 
-
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 # WebGL without a graphics card, and no talk with anybody's servers.
 FLAGS = "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --no-first-run "

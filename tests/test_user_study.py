@@ -18,10 +18,11 @@ from experiments import _run, _study, user_study
 from facejax.cli import runtime
 from facejax.data.synthetic import makehuman
 from facejax.inference import pipeline
+from facejax.models import bundle
 
 ROOT = Path(__file__).parents[1]
 TINY = {"composed": 2, "peaks": 2, "real": 1, "frames": 4, "width": 48}
-RELEASED = ROOT / "facejax" / "assets" / pipeline.RELEASED
+RELEASED = ROOT / "facejax" / "assets" / bundle.RELEASED
 
 
 @pytest.fixture(scope="module")

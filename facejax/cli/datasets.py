@@ -12,6 +12,7 @@ from facejax import io
 from facejax.cli import generate, outputs, runtime
 from facejax.data import dataset
 from facejax.data.synthetic import assets, makehuman, makehuman4d, noise
+from facejax.evaluation import vertex_error
 from facejax.inference import corpus, pipeline
 from facejax.training import sharding
 
@@ -39,7 +40,7 @@ def generate_corpus(
             raise ValueError(f"{model}: is in another topology than MakeHuman's people; leave --people out")
         neutrals = {who.name: who.vertices for who in map(makehuman.subject, range(people))}
     else:
-        vertices, notes = generate.neutral_face(face, model)
+        vertices, notes = generate.read_neutral(face, model)
         neutrals = {"average" if face is None else face.stem: vertices}
     outputs.writable(out)
     with outputs.progress(out.name, None) as advance:
@@ -96,7 +97,7 @@ def fit(
         count = math.gcd(count, plans.motion.batch, plans.residual.batch)
     mesh = sharding.line(jax.devices()[:count]) if count > 1 else None
     models = fit_bundle.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, mesh=mesh)
-    errors = fit_bundle.judge(models, found)
+    errors = vertex_error.of_models(models, found)
     if sharding.is_first():
         pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))
     sharding.meet("the models are written")

@@ -12,7 +12,7 @@ from facejax import io
 from facejax.cli import outputs, runtime
 from facejax.data.synthetic import assets, makehuman
 from facejax.inference import makehuman_portrait, motion_sources, pipeline, retarget, scans
-from facejax.io import atomic, livelink
+from facejax.io import atomic, livelink, neutral_face
 from facejax.landmarks import canonical_frame
 from facejax.viz import eyes_teeth, scene
 from facejax.viz.scene import Scene
@@ -71,12 +71,12 @@ def generate(
     return written
 
 
-def neutral_face(path: Path | None, model: Path | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_neutral(path: Path | None, model: Path | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """A user's neutral face in the model's topology, or the average face; and what was assumed about it."""
     face = pipeline.load(model).face
     if path is None:
         return np.asarray(face.vertices), ()
-    found = canonical_frame.read(
+    found = neutral_face.read(
         path,
         canonical_frame.Topology(*(np.asarray(x) for x in (face.vertices, face.landmark_index, face.source_index))),
     )
@@ -152,7 +152,7 @@ def animate(
     if len(face.landmarks) != eyes_teeth.IBUG:
         notes += (f"eyes and teeth are drawn for {eyes_teeth.IBUG} landmarks only",)
     elif eyes_teeth.has_eye_holes(face.vertices, face.faces, face.landmarks):
-        extras = eyes_teeth.parts(models.props, face.landmarks, marks)
+        extras = eyes_teeth.parts(eyes_teeth.template(), face.landmarks, marks)
     shot = scene.make(moved, face.faces, captions=motion.captions, landmarks=marks, extras=extras)
     return _write(out, f"{name}-{outputs.stem([motion.name])}", shot, rate, formats), notes
 

@@ -59,7 +59,7 @@ def _generate(command: Generate) -> None:
         raise ValueError("--end is missing: the expression to arrive at; `facejax labels` lists them")
     worn = None
     if command.landmarks is None:
-        neutral, notes = generate.neutral_face(command.face, command.model)
+        neutral, notes = generate.read_neutral(command.face, command.model)
     elif command.face is None:
         raise ValueError(f"--landmarks {command.landmarks}: of which scan? name it with --face")
     else:
@@ -165,9 +165,11 @@ def _said(result: tuple[list[Path], tuple[str, ...]]) -> None:
 
 
 def _register(command: Register) -> None:
+    from facejax.cli import outputs
     from facejax.inference import scans
 
     scan = scans.read(command.scan, command.landmarks)
+    outputs.writable(command.out)
     _said(scans.save(scan, scans.fit(scan), command.out))
 
 

@@ -63,7 +63,7 @@ def scene_of(
 ) -> Scene:
     """A generated animation with eyes, teeth and captions: neutral (N, 3), vertices (T, N, 3), marks (T, L, 3)."""
     rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
-    parts = eyes_teeth.parts(models.props, rest, marks)
+    parts = eyes_teeth.parts(eyes_teeth.template(), rest, marks)
     captions = pipeline.captions(labels, frames=frames)
     return viz_scene.make(vertices, np.asarray(models.face.faces), captions=captions, landmarks=marks, extras=parts)
 

@@ -29,12 +29,11 @@ import jax
 import numpy as np
 
 from facejax.data.mesh_subset import Meshes
-from facejax.evaluation import vertex_error
 from facejax.geometry import rbf
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.mesh import rbf_weights
 from facejax.models.decoders import dictionary, gpmm, gpmm_residual, linear, s2d_dec
-from facejax.training.recipes import fit_gpmm, fit_neural3dmm, fit_residual, fit_s2d_dec
+from facejax.training.recipes import fit_gpmm, fit_linear, fit_neural3dmm, fit_residual, fit_s2d_dec
 
 
 class Options(NamedTuple):
@@ -80,7 +79,7 @@ def _hierarchy(train: Meshes, options: Options) -> mesh_hierarchy.Hierarchy:
 
 def _linear(model: linear.Model, **fixed) -> Method:
     def fit(train: Meshes, folder: Path, options: Options) -> LinearFit:
-        return LinearFit(*vertex_error.fit_linear(model, train, by=options.by, **fixed))
+        return LinearFit(*fit_linear.fit_linear(model, train, by=options.by, **fixed))
 
     return Method(fit, _apply_linear)
 
@@ -91,7 +90,7 @@ def _apply_linear(fitted: LinearFit, displacements: np.ndarray, neutral: np.ndar
 
 def _fit_dictionary(train: Meshes, folder: Path, options: Options) -> LinearFit:
     index = np.asarray(train.data.landmark_index)
-    found = vertex_error.fit_linear(
+    found = fit_linear.fit_linear(
         dictionary.model, train, by=options.by, landmark_index=index, atoms=dictionary.ATOMS, seed=options.seed
     )
     return LinearFit(*found)
@@ -122,7 +121,7 @@ def _fit_whole(train: Meshes, folder: Path, options: Options) -> LinearFit:
         )
         return linear.pca.solve(at_rest, alpha=alpha)
 
-    return LinearFit(*vertex_error.fit_linear(linear.model(prepare, solve), train, by=options.by))
+    return LinearFit(*fit_linear.fit_linear(linear.model(prepare, solve), train, by=options.by))
 
 
 def _fit_s2d(train: Meshes, folder: Path, options: Options):

@@ -1,4 +1,4 @@
-"""How far from the truth, in millimetres: vertices of a decoder, landmarks of expression networks."""
+"""Vertex errors of decoders in millimetres, by person and region."""
 
 from __future__ import annotations
 
@@ -6,16 +6,12 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from facejax.data import sequences
+from facejax.data import dataset, mesh_subset
 from facejax.data.mesh_subset import Batch, Meshes
-from facejax.models import expression_lstm
-from facejax.models.decoders import linear
+from facejax.inference import pipeline
 
-ALPHAS = tuple(10.0**e for e in range(-8, 3))
-FOLDS = 4
 EDGES = np.geomspace(1e-5, 20.0, 253)  # mm, of cumulative curves: forty a decade
 
 
@@ -89,91 +85,15 @@ def _summed(pairs: Iterable[Batch], regions: dict[str, np.ndarray]) -> Distances
     return found
 
 
-def fit_linear(model: linear.Model, train: Meshes, *, by: str = "subjects", **options) -> tuple[linear.Params, float]:
-    """Fit ridge, PCA or a dictionary, the prior's weight chosen by cross-validation; and that weight.
-
-    Held out in turn are quarters of the training subjects, or `by="labels"` of the expressions.
-    """
-    # Every third mesh decides well enough, and the moments are what takes the time.
-    alpha, _ = linear.choose(model, train.thin(3).folds(FOLDS, by=by), ALPHAS, **options)
-    return model.fit(train, alpha=alpha, **options), alpha
-
-
-class MeanSequence(NamedTuple):
-    """The mean over training recordings of one expression, frame by frame; unitless."""
-
-    curve: np.ndarray  # (F, L, 3), standing still at the ends of shorter recordings
-    steps: np.ndarray  # (F - 1, L, 3)
-
-
-def mean_sequence(train: sequences.Sequences, frames: int) -> MeanSequence:
-    """The mean of recordings over the first `frames` frames."""
-    curve = sequences.extend(train, frames).curves[:, :frames].mean(axis=0)
-    return MeanSequence(curve, np.diff(curve, axis=0))
-
-
-def expression_scores(
-    params: expression_lstm.Params,
-    held_out: sequences.Sequences,
-    train: sequences.Sequences,
-    *,
-    start: str,
-    prefix: int = 10,
-) -> dict[str, float]:
-    """How well one expression's network moves faces that it has not seen, in mm, beside what asks for no network.
-
-    `next_*`: distance of the next frame's landmarks from where they are, given all frames before. `rest_*`: the frames
-    after the first `prefix`, given those. `whole_*`: all frames, given the neutral face. Means over the frames of each
-    sequence, then over sequences. `energy` (mean squared step) and `acceleration` (mean norm of second differences) of
-    what is made from the neutral face, over those of the recordings in the same frames.
-    """
-    frames = held_out.curves.shape[1]
-    mean = mean_sequence(train, frames)
-    truth, scale, count = held_out.curves, held_out.scale, held_out.frames
-    neutral = jnp.asarray(held_out.neutral) if start == "neutral" else None
-
-    def error(curves, first=0):
-        off = np.linalg.norm(np.asarray(curves) - truth, axis=-1).mean(axis=-1) * scale[:, None]
-        return float(np.mean([row[first:end].mean() for row, end in zip(off, count, strict=True)]))
-
-    steps = np.diff(truth, axis=1)
-    known = np.concatenate([np.zeros_like(steps[:, :1]), steps[:, :-1]], axis=1)
-    before = truth[:, :-1]
-
-    def after(following):
-        return np.concatenate([truth[:, :1], before + np.asarray(following)], axis=1)
-
-    here, velocity = truth[:, prefix - 1 : prefix], steps[:, prefix - 2 : prefix - 1]
-    ahead = np.arange(frames)[:, None, None] - (prefix - 1)
-    free = np.broadcast_to(np.asarray(expression_lstm.generate(params, neutral, frames=frames)), truth.shape)
-    led = expression_lstm.generate(params, neutral, jnp.asarray(truth[:, :prefix]), frames=frames)
-
-    def over_real(curves, order):
-        """Mean squared steps, or mean norms of second differences, over those of the recordings."""
-
-        def strength(rows):
-            # In NumPy: every sequence has its own length, and a jitted function would compile for each.
-            changes = (
-                np.linalg.norm(np.diff(row[:end] * mm, n=order, axis=0), axis=-1)
-                for row, mm, end in zip(rows, scale, count, strict=True)
-            )
-            return np.mean([np.mean(change**2 if order == 1 else change) for change in changes])
-
-        return float(strength(curves) / strength(truth))
-
-    mean_curves = np.broadcast_to(mean.curve, truth.shape)
-    return {
-        "next_network": error(after(expression_lstm.predict(params, known, neutral)), 1),
-        "next_velocity": error(after(known), 1),
-        "next_mean": error(after(np.broadcast_to(mean.steps, steps.shape)), 1),
-        "rest_network": error(led, prefix),
-        "rest_velocity": error(here + ahead * velocity, prefix),
-        "rest_mean": error(mean_curves, prefix),
-        "rest_mean_steps": error(mean.curve + here - mean.curve[prefix - 1], prefix),
-        "whole_network": error(free),
-        "whole_mean": error(mean_curves),
-        "energy": over_real(free, 1),
-        "energy_mean": over_real(mean_curves, 1),
-        "acceleration": over_real(free, 2),
-        "acceleration_mean": over_real(mean_curves, 2),
-    }
+def of_models(models: pipeline.Models, data: dataset.Store, *splits: str) -> dict[str, float]:
+    """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
+    held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
+    if not held:
+        return {}
+    regions = {"head": np.ones(len(models.face.vertices), bool), "face": np.asarray(models.face.mask)}
+    at = models.face.landmark_index
+    found = distances(
+        lambda marks, rest: np.asarray(pipeline.meshes(models, rest[at] + marks, rest)),
+        mesh_subset.of_split(data, *held), regions,
+    )  # fmt: skip
+    return {name: found.mean_std(mask)[0] for name, mask in regions.items()}

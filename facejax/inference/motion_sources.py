@@ -106,7 +106,7 @@ def posed(recording: livelink.Recording, person: makehuman.Subject, *, intensity
 
     `intensity` scales the weights.
     """
-    return rig.pose(rig.build(person, level=LEVEL), intensity * livelink.unit_weights(recording))
+    return rig.pose(rig.build(person, level=LEVEL), intensity * livelink.unit_weights(recording, rig.unit_names()))
 
 
 def rate_of(recording: livelink.Recording) -> float:

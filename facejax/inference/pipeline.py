@@ -10,86 +10,35 @@ Millimetres. A neutral face is (N, 3) vertices in the models' topology; T frames
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Sequence
-from importlib import resources
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import traverse_util
 
 from facejax.inference import composition
-from facejax.io import weights
-from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.models.bundle import Face, Models, load, save
 from facejax.models.decoders import gpmm_residual, s2d_dec
-from facejax.models.motion import generators, start_poses, tangent_pca
-from facejax.viz import eyes_teeth
+
+__all__ = [
+    "FRAMES",
+    "RATE",
+    "Face",
+    "Models",
+    "captions",
+    "displacements",
+    "durations",
+    "label_indices",
+    "landmarks",
+    "lengths",
+    "load",
+    "meshes",
+    "neutral_landmarks",
+    "save",
+]
 
 RATE = 30.0  # frames per second at which motions are played
 FRAMES = 30  # of a transition, as the generator learnt them
-RELEASED = "makehuman4d.safetensors"
-S2D, REFINED = "s2d", "refined"  # kinds of decoder
-COMPONENTS = 200  # of the best linear answer, in a file: as many more gain 0.001 mm, and weigh 4 MB
-
-
-class Face(NamedTuple):
-    """The topology that the models were trained on."""
-
-    vertices: np.ndarray  # (N, 3) a neutral face to start from: the average of the population
-    faces: np.ndarray  # (F, 3) triangles
-    landmark_index: np.ndarray  # (L,) vertices
-    source_index: np.ndarray  # (N,) vertices of MakeHuman's body, or empty: another topology
-    mask: np.ndarray  # (N,) bool, the face region
-
-
-class Models(NamedTuple):
-    """Everything that inference needs."""
-
-    labels: tuple[str, ...]  # neutral first
-    face: Face
-    props: eyes_teeth.Props  # eyes and teeth of the template, for pictures; without landmarks: none
-    motion: generators.Params
-    starts: start_poses.Params  # peaks from which a motion starts that does not start at neutral
-    hierarchy: mesh_hierarchy.Hierarchy
-    decoder: s2d_dec.Params | gpmm_residual.Params  # S2D-Dec, or the best linear answer refined
-    about: dict[str, Any]  # how the weights were made
-
-
-def load(path: str | os.PathLike | None = None) -> Models:
-    """The released models, or those of a file. Raises `weights.WeightsError`."""
-    path = path or resources.files("facejax.assets").joinpath(RELEASED)
-    about = weights.load_metadata(path)
-    try:
-        like = _structure(about["shapes"], about["generator"])
-    except (KeyError, TypeError) as error:
-        raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
-    tree, about = weights.load(path, like)
-    try:
-        tree["hierarchy"] = mesh_hierarchy.load(tree["hierarchy"])
-        if about.get("decoder", S2D) == REFINED:
-            tree["decoder"] = gpmm_residual.unpack(tree["decoder"], tree["hierarchy"], tree["face"].faces)
-    except (ValueError, KeyError, TypeError) as error:
-        raise weights.WeightsError(f"{path}: {error}") from error
-    # The face and its props stay on the host: they are read by exporters, not by networks.
-    networks = ["motion", "starts", "hierarchy"]
-    networks += ["decoder"] if isinstance(tree["decoder"], s2d_dec.Params) else []
-    moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in networks}
-    return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
-
-
-def save(path: str | os.PathLike, models: Models) -> None:
-    """Write models to one safetensors file; `about` gains what `load` needs."""
-    tree = models._asdict()
-    refined = isinstance(models.decoder, gpmm_residual.Params)
-    about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
-    about["decoder"] = REFINED if refined else S2D
-    tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)
-    if refined:
-        tree["decoder"] = gpmm_residual.pack(models.decoder, components=COMPONENTS)
-    leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
-    weights.save(path, tree, metadata=about | {"shapes": leaves})
 
 
 def landmarks(
@@ -232,36 +181,3 @@ def _numbers(models: Models, labels: Sequence[str]) -> np.ndarray:
 @jax.jit
 def _decode(params, hierarchy, displacements, neutral):
     return neutral + s2d_dec.apply(params, hierarchy, displacements)
-
-
-def _structure(shapes: dict[str, list], generator: str) -> dict[str, Any]:
-    """The tree to expect, rebuilt from the leaf names, dtypes and shapes that a file states.
-
-    Raises `KeyError` or `TypeError` where the names are not those of our records.
-    """
-    flat = {name: jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype)) for name, (dtype, shape) in shapes.items()}
-    nested = traverse_util.unflatten_dict(flat, sep="/")
-    tables = {f"{table}/{i}": leaf for table, rows in nested["hierarchy"].items() for i, leaf in rows.items()}
-    networks = {}
-    for name in ("motion", "decoder"):
-        networks[name] = _listed(nested[name].get("weights", {}))
-    return {
-        "face": Face(**nested["face"]),
-        "props": eyes_teeth.Props(**nested["props"]),
-        "motion": generators.KINDS[generator](tangent_pca.Chart(**nested["motion"]["chart"]), networks["motion"]),
-        "starts": start_poses.Params(**nested["starts"]),
-        "hierarchy": tables,
-        "decoder": (
-            _listed(nested["decoder"])
-            if "base" in nested["decoder"]
-            else s2d_dec.Params(s2d_dec.Scale(**nested["decoder"]["scale"]), networks["decoder"])
-        ),
-    }
-
-
-def _listed(tree: Any) -> Any:
-    """A nested dict whose numbered entries, "0" to the last, are lists again."""
-    if not isinstance(tree, dict):
-        return tree
-    rows = {name: _listed(rows) for name, rows in tree.items()}
-    return [rows[str(i)] for i in range(len(rows))] if "0" in rows else rows

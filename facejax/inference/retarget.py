@@ -73,7 +73,7 @@ def prepare(
     try:
         millimetres, unit = canonical_frame.unit_of(size, name)
         notes += [f"read as {unit}"] if unit != "millimetres" else []
-    except MeshError:
+    except canonical_frame.FaceError:
         millimetres = 1 / size
         notes.append("in no usual unit: scaled to the size of a head")
     if len(points) < len(template):

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax import io
-from facejax.cli import outputs
 from facejax.data.synthetic import makehuman
 from facejax.inference import pipeline, registration
 from facejax.io import atomic
@@ -80,9 +79,11 @@ def read(path: Path, landmarks: Path) -> Scan:
     wanted = template.vertices[template.landmarks[which]]
     try:
         _, size = canonical_frame.place(points, wanted)
+        unit, name = canonical_frame.unit_of(size, str(path))
+    except canonical_frame.FaceError as error:  # names the file
+        raise MeshError(str(error)) from error
     except ValueError as error:
         raise MeshError(f"{path}: {error}") from error
-    unit, name = canonical_frame.unit_of(size, str(path))
     notes = [f"read as {name}"]
     if len(which) < 68:
         notes.append(f"{len(which)} of 68 landmarks are given, the others are estimated")
@@ -111,7 +112,6 @@ def save(scan: Scan, found: registration.Registration, out: Path) -> tuple[list[
     The mesh and the landmarks are in the scan's own place and unit. The files, and what was assumed.
     """
     model = people()
-    outputs.writable(out)
     marks = found.vertices[model.landmark_index]
     hits = closest_point.query(closest_point.surface(scan.vertices, scan.faces), marks)
     paths = [out / f"{scan.name}-{what}" for what in ("template.ply", "landmarks.json", "fit.json", "fit.png")]
@@ -176,7 +176,9 @@ def scene_of(models: pipeline.Models, worn: Worn, vertices: np.ndarray, marks: n
     rest = np.asarray(pipeline.neutral_landmarks(models, worn.neutral))
     moved = worn.still + registration.carry(worn.hung, vertices - worn.neutral)
     extras = (
-        eyes_teeth.parts(models.props, rest, marks) if eyes_teeth.has_eye_holes(worn.still, worn.faces, rest) else ()
+        eyes_teeth.parts(eyes_teeth.template(), rest, marks)
+        if eyes_teeth.has_eye_holes(worn.still, worn.faces, rest)
+        else ()
     )
     captions = pipeline.captions(labels, frames=frames)
     return scene.make(moved, worn.faces, captions=captions, landmarks=marks, extras=extras)

@@ -26,12 +26,12 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from facejax.data.synthetic import rig
 from facejax.io import atomic
 
 _SIDED = ("Left", "Right")
@@ -163,9 +163,11 @@ def above_rest(recording: Recording, resting: np.ndarray | None = None) -> Recor
     return recording._replace(weights=weights.astype(np.float32))
 
 
-def unit_weights(recording: Recording) -> np.ndarray:
-    """Weights (T, U) float32 for `rig.pose`. The tongue moves no skin and is left out; MakeHuman's own units are 0."""
-    units = rig.unit_names()
+def unit_weights(recording: Recording, units: Sequence[str]) -> np.ndarray:
+    """Weights (T, U) float32 of the U named units of a rig.
+
+    Units that are no ARKit shape get 0, such as MakeHuman's own;
+    shapes that are no unit are left out, such as the tongue's."""
     weights = np.zeros((len(recording.weights), len(units)), np.float32)
     for column, name in enumerate(NAMES):
         if name in units:

@@ -7,19 +7,21 @@ with the template's, and said aloud; the face stays where it is otherwise."""
 from __future__ import annotations
 
 import itertools
-import os
 from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
 
 from facejax.geometry import align
-from facejax.io import meshes
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
 SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
 ALIKE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
 HEAD_RANGE = (100.0, 400.0)  # mm, the longest side of a head, or of a face alone, from chin to brow
+
+
+class FaceError(ValueError):
+    """Vertices or landmarks that do not form a head, or of no known unit or topology."""
 
 
 class Topology(NamedTuple):
@@ -37,29 +39,24 @@ class Face(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read(path: str | os.PathLike, topology: Topology) -> Face:
-    """Read a neutral face. Raises `meshes.MeshError` for a damaged file, another topology, or an unknown unit."""
-    return fit(meshes.read(path).vertices, topology, name=str(path))
-
-
 def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> Face:
     """Bring vertices (V, 3) in any accepted topology, unit and axis order to the model's."""
     vertices, notes = np.asarray(vertices, np.float64), []
     count, bodies = len(topology.vertices), (13_380, 19_158)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise meshes.MeshError(f"{name}: vertices must be ({count}, 3), got {vertices.shape}")
+        raise FaceError(f"{name}: vertices must be ({count}, 3), got {vertices.shape}")
     if len(vertices) in bodies and len(vertices) != count and len(topology.source_index):
         vertices = vertices[topology.source_index]
         notes.append(f"took the head's {count} vertices of a MakeHuman body")
     if len(vertices) != count:
-        raise meshes.MeshError(
+        raise FaceError(
             f"{name}: {len(vertices)} vertices, expected {count} (the model's topology)"
             + (f", or {bodies[0]} or {bodies[1]} (a MakeHuman body)" if len(topology.source_index) else "")
             + "; `facejax data makehuman --sample DIR` writes faces to try"
         )
     bad = ~np.isfinite(vertices).all(axis=1)
     if bad.any():
-        raise meshes.MeshError(f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}")
+        raise FaceError(f"{name}: vertex {int(np.argmax(bad))} is not finite: {vertices[np.argmax(bad)]}")
     marks = topology.landmark_index
     turn = _axes(vertices[marks], topology.vertices[marks], name)
     notes += axes_note(turn)
@@ -95,12 +92,12 @@ def template68() -> np.ndarray:
 def unit_of(size: float, name: str) -> tuple[float, str]:
     """Millimetres of the unit in which a face of `size`, against the template's in millimetres, is a head's; its name.
 
-    Raises `meshes.MeshError` where it is none.
+    Raises `FaceError` where it is none.
     """
     for unit, millimetres in UNITS.items():
         if SIZE_RANGE[0] <= size * millimetres <= SIZE_RANGE[1]:
             return millimetres, unit
-    raise meshes.MeshError(
+    raise FaceError(
         f"{name}: the face is {size:.3g} times as large as a head in millimetres; expected one in {', '.join(UNITS)}"
     )
 
@@ -111,7 +108,7 @@ def unit_of_head(size: float, name: str) -> tuple[float, str]:
         if HEAD_RANGE[0] <= size * millimetres <= HEAD_RANGE[1]:
             return millimetres, unit
     low, high = HEAD_RANGE
-    raise meshes.MeshError(
+    raise FaceError(
         f"{name}: {size:.3g} in size; expected a head of {low:g} to {high:g} mm, given in {', '.join(UNITS)}"
     )
 
@@ -143,12 +140,12 @@ def spread(points: np.ndarray) -> float:
 def _axes(points: np.ndarray, target: np.ndarray, name: str) -> np.ndarray:
     """Of the 24 rotations that permute the axes, the one under which the landmarks look most like the template's."""
     if spread(points) == 0:
-        raise meshes.MeshError(f"{name}: all landmarks coincide: this is no face")
+        raise FaceError(f"{name}: all landmarks coincide: this is no face")
     shape, wanted = ((p - p.mean(axis=0)) / spread(p) for p in (points, target))
     nearest = min(turns(), key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
     best = np.linalg.norm(shape @ nearest.T - wanted)
     if best > 0.6:
-        raise meshes.MeshError(
+        raise FaceError(
             f"{name}: its landmarks do not form a face (distance {best:.2f} of at most 0.6): the right number of "
             "vertices, but in another order?"
         )

@@ -5,6 +5,8 @@ millimetres."""
 
 from __future__ import annotations
 
+import functools
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +33,14 @@ class Props(NamedTuple):
     upper_faces: np.ndarray  # (K, 3)
     lower_teeth: np.ndarray  # (P, 3)
     lower_faces: np.ndarray  # (K, 3)
+
+
+@functools.cache
+def template() -> Props:
+    """The eyes and teeth of MakeHuman's average head, millimetres."""
+    with resources.files("facejax.assets").joinpath("eyes_teeth.npz").open("rb") as stream:
+        arrays = np.load(stream, allow_pickle=False)
+        return Props(**{name: arrays[name] for name in Props._fields})
 
 
 def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[scene.Part, ...]:

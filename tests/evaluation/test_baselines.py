@@ -7,7 +7,7 @@ from facejax.data.mesh_subset import of_split
 from facejax.evaluation import baselines, vertex_error
 from facejax.mesh import hierarchy
 from facejax.models.decoders import dictionary, gpmm, linear, s2d_dec
-from facejax.training.recipes import fit_gpmm, fit_neural3dmm, fit_residual, fit_s2d_dec
+from facejax.training.recipes import fit_gpmm, fit_linear, fit_neural3dmm, fit_residual, fit_s2d_dec
 
 FRAMES = 3
 
@@ -89,7 +89,7 @@ def test_linear_methods_are_linear_maps_with_the_alpha_that_is_chosen(fitted, tr
         "pca38": (linear.pca, {"components": 38}),
         "pca220": (linear.pca, {"components": 220}),
     }[name]
-    params, alpha = vertex_error.fit_linear(model, train, **fixed)
+    params, alpha = fit_linear.fit_linear(model, train, **fixed)
     assert fitted(name).alpha == alpha
     np.testing.assert_allclose(moved(fitted, name, new), new[0] + linear.apply(params, new[1]), atol=1e-3)
 

@@ -5,9 +5,10 @@ import pytest
 
 from facejax.data import sequences
 from facejax.data.mesh_subset import of_split
-from facejax.evaluation import vertex_error
+from facejax.evaluation import expression_error, vertex_error
 from facejax.models import expression_lstm
 from facejax.models.decoders import linear
+from facejax.training.recipes import fit_linear
 
 L, F = 4, 14
 
@@ -33,7 +34,7 @@ def all_knowing(monkeypatch):
 
 
 def test_the_truth_misses_nothing(all_knowing):
-    found = vertex_error.expression_scores(None, all_knowing, recordings(2), start="zero", prefix=6)
+    found = expression_error.expression_scores(None, all_knowing, recordings(2), start="zero", prefix=6)
     for name in ("next_network", "rest_network", "whole_network"):
         assert found[name] == pytest.approx(0, abs=1e-4)
     assert found["energy"] == pytest.approx(1) and found["acceleration"] == pytest.approx(1)
@@ -41,7 +42,7 @@ def test_the_truth_misses_nothing(all_knowing):
 
 def test_the_rivals_are_the_loops(all_knowing):
     train, prefix = recordings(2), 6
-    found = vertex_error.expression_scores(None, all_knowing, train, start="zero", prefix=prefix)
+    found = expression_error.expression_scores(None, all_knowing, train, start="zero", prefix=prefix)
     mean = np.mean(train.curves, axis=0)
     wanted = {name: [] for name in found}
     for curve, end, scale in zip(all_knowing.curves, all_knowing.frames, all_knowing.scale, strict=True):
@@ -73,14 +74,14 @@ def test_the_rivals_are_the_loops(all_knowing):
 def test_the_strength_of_motion_is_over_the_recordings_own_frames(monkeypatch, all_knowing):
     doubled = 2 * all_knowing.curves
     monkeypatch.setattr(expression_lstm, "generate", lambda params, neutral, prefix=None, *, frames: doubled)
-    found = vertex_error.expression_scores(None, all_knowing, recordings(2), start="zero", prefix=6)
+    found = expression_error.expression_scores(None, all_knowing, recordings(2), start="zero", prefix=6)
     assert found["energy"] == pytest.approx(4, rel=1e-5) and found["acceleration"] == pytest.approx(2, rel=1e-5)
     assert 0 < found["energy_mean"] < 1 and 0 < found["acceleration_mean"] < 1
 
 
 def test_the_mean_sequence_has_room_for_longer_ones():
     train = recordings(3)
-    mean = vertex_error.mean_sequence(train, F + 4)
+    mean = expression_error.mean_sequence(train, F + 4)
     assert mean.curve.shape == (F + 4, L, 3) and mean.steps.shape == (F + 3, L, 3)
     np.testing.assert_allclose(mean.curve[F:], np.repeat(mean.curve[F - 1 : F], 4, axis=0), rtol=1e-5)
 
@@ -164,15 +165,15 @@ def test_distances_of_nothing_are_refused(ball_store):
 @pytest.mark.parametrize("by", ["subjects", "labels"])
 def test_linear_maps_take_the_alpha_that_held_out_groups_like_best(ball_store, by):
     train = of_split(ball_store, "train")
-    params, alpha = vertex_error.fit_linear(linear.ridge, train, by=by)
-    errors = np.zeros(len(vertex_error.ALPHAS))
+    params, alpha = fit_linear.fit_linear(linear.ridge, train, by=by)
+    errors = np.zeros(len(fit_linear.ALPHAS))
     thin = train.rows(np.arange(0, train.count, 3))
     of = thin.owner if by == "subjects" else thin.labels
     for group in np.unique(of):  # four of either, and four folds
         known, held_out = thin.where(of != group), thin.where(of == group)
-        for i, candidate in enumerate(vertex_error.ALPHAS):
+        for i, candidate in enumerate(fit_linear.ALPHAS):
             fitted = linear.ridge.fit(known, alpha=candidate)
             errors[i] += sum(np.linalg.norm(linear.apply(fitted, m) - v, axis=-1).sum() for m, v in held_out)
-    assert alpha == vertex_error.ALPHAS[int(np.argmin(errors))]
+    assert alpha == fit_linear.ALPHAS[int(np.argmin(errors))]
     expected = linear.ridge.fit(train, alpha=alpha)
     np.testing.assert_array_equal(params.factors[0], expected.factors[0])

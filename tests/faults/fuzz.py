@@ -24,6 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from facejax.models import bundle
+
 NUMBERS = [b"0", b"-1", b"1e308", b"-1e-308", b"nan", b"inf", b"1000000000000", b"99999999999999999999999999", b"2.5"]
 NUMBERS += [b"true", b"null", b"[]", b"{}", b'"a"', b"../../../etc/passwd", b"4294967295", b"2147483648", b""]
 VERTICES = np.array([[0, 0, 0], [90, 0, 0], [0, 90, 0], [0, 0, 90], [60, 60, 60.0]])
@@ -201,7 +203,7 @@ def readers() -> dict[str, Callable[[], Reader]]:
         """The header of the released models, over no numbers."""
         from importlib import resources
 
-        data = resources.files("facejax.assets").joinpath(pipeline.RELEASED).read_bytes()
+        data = resources.files("facejax.assets").joinpath(bundle.RELEASED).read_bytes()
         size = int.from_bytes(data[:8], "little")
         return Reader(".safetensors", [data[: 8 + size + 4096]], pipeline.load, (weights.WeightsError,))
 

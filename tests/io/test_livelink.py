@@ -189,7 +189,7 @@ def test_above_rest_keeps_what_is_full():
 
 def test_unit_weights_drive_the_rig(path):
     _csv(path, TIMES[:3], EyeBlinkRight=[0, 0.5, 1], JawOpen=[0, 0, 0.7], TongueOut=1.0)
-    weights = livelink.unit_weights(livelink.read(path))
+    weights = livelink.unit_weights(livelink.read(path), rig.unit_names())
     names = rig.unit_names()
     assert weights.shape == (3, len(names)) and weights.dtype == np.float32
     np.testing.assert_allclose(weights[:, names.index("eyeBlinkRight")], [0, 0.5, 1])

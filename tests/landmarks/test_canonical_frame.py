@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from facejax.data.synthetic import assets, makehuman
-from facejax.io import meshes
+from facejax.io import meshes, neutral_face
 from facejax.landmarks import canonical_frame
 
 
@@ -46,26 +46,33 @@ def test_the_head_is_cut_out_of_a_body(topology, person, count, tmp_path):
     body[topology.source_index] = person + [0, 1600, 0]
     path = tmp_path / "body.obj"
     meshes.write(path, body / 1000, np.array([[0, 1, 2]]))
-    found = canonical_frame.read(path, topology)
+    found = neutral_face.read(path, topology)
     np.testing.assert_allclose(found.vertices, person + np.float32([0, 1600, 0]), atol=1e-3)
     assert "MakeHuman body" in found.notes[0] and "metres" in found.notes[1]
 
 
 def test_what_is_no_face_is_refused(topology, person):
-    with pytest.raises(meshes.MeshError, match=r"12 vertices, expected 3260.*13380 or 19158.*--sample"):
+    with pytest.raises(canonical_frame.FaceError, match=r"12 vertices, expected 3260.*13380 or 19158.*--sample"):
         canonical_frame.fit(np.zeros((12, 3)), topology)
-    with pytest.raises(meshes.MeshError, match="vertex 7 is not finite"):
+    with pytest.raises(canonical_frame.FaceError, match="vertex 7 is not finite"):
         broken = person.copy()
         broken[7, 1] = np.nan
         canonical_frame.fit(broken, topology)
-    with pytest.raises(meshes.MeshError, match="another order"):
+    with pytest.raises(canonical_frame.FaceError, match="another order"):
         canonical_frame.fit(np.random.default_rng(0).permutation(person), topology)
-    with pytest.raises(meshes.MeshError, match="times as large as a head"):
+    with pytest.raises(canonical_frame.FaceError, match="times as large as a head"):
         canonical_frame.fit(person * 30, topology)
-    with pytest.raises(meshes.MeshError, match="coincide"):
+    with pytest.raises(canonical_frame.FaceError, match="coincide"):
         canonical_frame.fit(np.zeros_like(person), topology)
-    with pytest.raises(meshes.MeshError, match=r"must be \(3260, 3\)"):
+    with pytest.raises(canonical_frame.FaceError, match=r"must be \(3260, 3\)"):
         canonical_frame.fit(person[:, :2], topology)
+
+
+def test_a_file_with_another_topology_is_refused_as_a_mesh(topology, tmp_path):
+    path = tmp_path / "small.obj"
+    meshes.write(path, np.zeros((12, 3)), np.array([[0, 1, 2]]))
+    with pytest.raises(meshes.MeshError, match=r"small.obj: 12 vertices, expected 3260"):
+        neutral_face.read(path, topology)
 
 
 @pytest.mark.parametrize(("size", "unit"), [(231.0, "millimetres"), (0.147, "metres"), (12.0, "centimetres")])
@@ -73,5 +80,5 @@ def test_the_unit_of_a_mesh_without_known_landmarks_is_told_by_its_size(size, un
     """Heads, and faces cut out of them: no size fits two units."""
     millimetres, found = canonical_frame.unit_of_head(size, "it")
     assert found == unit and millimetres == canonical_frame.UNITS[unit]
-    with pytest.raises(meshes.MeshError, match="it: 41 in size; expected a head of 100 to 400 mm"):
+    with pytest.raises(canonical_frame.FaceError, match="it: 41 in size; expected a head of 100 to 400 mm"):
         canonical_frame.unit_of_head(41.0, "it")

@@ -23,7 +23,7 @@ from facejax.data import dataset
 from facejax.data.importers import base, worker
 from facejax.data.importers.base import Source, SourceError
 from facejax.data.synthetic import makehuman4d
-from facejax.io import atomic, landmarks, meshes
+from facejax.io import atomic, landmarks
 from facejax.landmarks import canonical_frame, schemes
 
 VERSION = 1
@@ -260,7 +260,7 @@ def _unit(shared: base.Common, index: np.ndarray, unit: str | None) -> tuple[str
             if spread is None
             else canonical_frame.unit_of(spread, shared.name)
         )
-    except meshes.MeshError as error:
+    except canonical_frame.FaceError as error:
         raise SourceError(f"{error}; or name the unit: {', '.join(UNITS)}") from error
     return name, scale
 

@@ -84,7 +84,7 @@ def _weights(path: Path, rate: float) -> tuple[np.ndarray, tuple[str, ...]]:
         even = livelink.resample(livelink.above_rest(livelink.read(path)), rate=rate)
     except livelink.RecordingError as error:
         raise SourceError(str(error)) from error
-    return livelink.unit_weights(even), even.notes
+    return livelink.unit_weights(even, rig.unit_names()), even.notes
 
 
 @functools.lru_cache(maxsize=2)

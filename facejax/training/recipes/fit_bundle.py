@@ -14,13 +14,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from facejax.data import dataset, mesh_subset, motions, transitions
-from facejax.data.synthetic import makehuman
-from facejax.evaluation import vertex_error
-from facejax.inference import pipeline
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.mesh import rbf_weights
+from facejax.models import bundle
 from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual
-from facejax.viz import eyes_teeth
 
 FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
 
@@ -34,7 +31,7 @@ class Plans(NamedTuple):
 
 def fit(
     data: dataset.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
-) -> pipeline.Models:
+) -> bundle.Models:
     """Train on the training subjects of a store; `mesh` as in `training.run`.
 
     Raises `ValueError` where the store holds too little to learn from.
@@ -52,14 +49,13 @@ def fit(
     beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
     train = mesh_subset.of_split(data, "train")
     # As many components as the file will hold: the network refines the very answer that it will meet.
-    base = fit_gpmm.fit(train, components=pipeline.COMPONENTS)
+    base = fit_gpmm.fit(train, components=bundle.COMPONENTS)
     expander = fit_residual.fit(
         train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, mesh=mesh
     )
-    return pipeline.Models(
+    return bundle.Models(
         labels=data.labels,
-        face=pipeline.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.region(mean, faces, at)),
-        props=props(),
+        face=bundle.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.region(mean, faces, at)),
         motion=generator,
         starts=beginnings,
         hierarchy=hierarchy,
@@ -83,23 +79,3 @@ def check(data: dataset.Store) -> None:
             f"{data.path}: expected training recordings of two or more expressions, and of every label; got "
             f"{len(named)}" + (f", none of {', '.join(lacking)}" if lacking else "")
         )
-
-
-def judge(models: pipeline.Models, data: dataset.Store, *splits: str) -> dict[str, float]:
-    """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
-    held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
-    if not held:
-        return {}
-    regions = {"head": np.ones(len(models.face.vertices), bool), "face": np.asarray(models.face.mask)}
-    at = models.face.landmark_index
-    found = vertex_error.distances(
-        lambda marks, rest: np.asarray(pipeline.meshes(models, rest[at] + marks, rest)),
-        mesh_subset.of_split(data, *held), regions,
-    )  # fmt: skip
-    return {name: found.mean_std(mask)[0] for name, mask in regions.items()}
-
-
-def props() -> eyes_teeth.Props:
-    """The template's eyes and teeth, for pictures of faces that came without; used where there are 68 landmarks."""
-    shape = makehuman.template()
-    return eyes_teeth.Props(shape.vertices[shape.landmarks], *makehuman.template_props())

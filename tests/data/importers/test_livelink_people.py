@@ -32,7 +32,9 @@ def test_every_performer_plays_people_of_their_own(takes, tmp_path):
     # What the rig makes of the recording's weights above rest.
     even = livelink.resample(livelink.above_rest(livelink.read(takes / "ben" / "mouth_open_01.csv")), rate=30)
     person = makehuman.subject(1)
-    posed = rig.pose(rig.build(person, level=1), livelink.unit_weights(even))[:, : len(person.vertices)]
+    posed = rig.pose(rig.build(person, level=1), livelink.unit_weights(even, rig.unit_names()))[
+        :, : len(person.vertices)
+    ]
     first = data.sequences[2].start
     np.testing.assert_allclose(data.vertices[first : first + 36], posed, atol=1e-4)
     np.testing.assert_array_equal(data.neutral[1], person.vertices)

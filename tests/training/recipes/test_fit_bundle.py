@@ -6,6 +6,7 @@ import pytest
 
 from facejax.cli import main
 from facejax.data import transitions
+from facejax.evaluation import vertex_error
 from facejax.inference import pipeline
 from facejax.training.recipes import fit_bundle, fit_gpmm, fit_motion, fit_residual
 
@@ -31,7 +32,7 @@ def models(few, tiny_store, tmp_path_factory):
 
 
 def test_models_of_ones_own_generate_from_a_file(models, tiny_store, tmp_path):
-    errors = fit_bundle.judge(models, tiny_store)
+    errors = vertex_error.of_models(models, tiny_store)
     assert 0 < errors["head"] < errors["face"] < 0.3
     path = tmp_path / "own.safetensors"
     pipeline.save(path, models._replace(about=models.about | {"error_mm": errors}))

@@ -9,7 +9,7 @@ from facejax.data.synthetic import makehuman
 from facejax.evaluation import vertex_error
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.models.decoders import linear, s2d_dec
-from facejax.training.recipes import fit_s2d_dec
+from facejax.training.recipes import fit_linear, fit_s2d_dec
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +71,8 @@ def test_vertex_errors_are_those_of_the_plain_loop(tiny_store, regions):
 
 def test_ridge_beats_no_motion_on_unseen_people(tiny_store, regions):
     train, test = of_split(tiny_store, "train"), of_split(tiny_store, "test")
-    params, alpha = vertex_error.fit_linear(linear.ridge, train)
-    assert alpha in vertex_error.ALPHAS
+    params, alpha = fit_linear.fit_linear(linear.ridge, train)
+    assert alpha in fit_linear.ALPHAS
     mean = vertex_error.vertex_errors(lambda m: linear.apply(params, m), test, regions)["head"]["mean_mm"]
     still = vertex_error.vertex_errors(lambda m: np.zeros((len(m), 3260, 3)), test, regions)["head"]["mean_mm"]
     assert mean < 0.5 * still
