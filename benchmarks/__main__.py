@@ -141,7 +141,7 @@ def _written(documents: list[dict[str, Any]], out: Path) -> tuple[str, list[dict
         table += "\n\n" + _sizes.table(sizes)
         _sizes.plot(sizes, out / "sizes.png")
     table += "\n\n" + _made(documents) + "\n"
-    with atomic.replacing(out / "table.md") as temporary:
+    with atomic.replace_file(out / "table.md") as temporary:
         temporary.write_text(table)
     return table, sizes
 
@@ -161,7 +161,7 @@ def _publish(config: Config, runs: list[list[dict[str, Any]]], table: str, sizes
     _measure.write(RESULTS / f"{config.name}.json", {"benchmarks": runs[-1]})
     rows = [row for document in runs[-1] for row in document["rows"]]
     for name, text in ((config.name, table), (f"{config.name}_headline", _headline.table(rows) + "\n")):
-        with atomic.replacing(RESULTS / f"{name}.md") as temporary:
+        with atomic.replace_file(RESULTS / f"{name}.md") as temporary:
             temporary.write_text(text)
     _sizes.plot(sizes, RESULTS / f"{config.name}_sizes.png")
     if config.name == "cpu":

@@ -29,7 +29,7 @@ Tensors = Any
 class Peer:
     """Weights, tables and optimiser. Displacements are taken as they are: the scale of the parameters is the unit."""
 
-    def __init__(self, params: s2d_dec.Params, hierarchy: Hierarchy, *, rate: float, weight_decay: float):
+    def __init__(self, params: s2d_dec.S2DDec, hierarchy: Hierarchy, *, rate: float, weight_decay: float):
         self.weights = jax.tree.map(tensor, params.weights)
         self.trained = jax.tree.leaves(self.weights)
         for weight in self.trained:

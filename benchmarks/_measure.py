@@ -121,7 +121,7 @@ def _unwritable(path: Path) -> str | None:
 
 def write(path: Path, document: Any) -> None:
     """A JSON file, whole or not at all."""
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 

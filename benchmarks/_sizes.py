@@ -83,6 +83,6 @@ def plot(rows: Iterable[Row], path: Path) -> None:
         panel.set(xlabel=axis, ylabel="ms")
         panel.legend(fontsize=7, title="work: exponent", title_fontsize=7)
         panel.grid(alpha=0.3)
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         figure.savefig(temporary, dpi=110)
     plt.close(figure)

@@ -27,7 +27,7 @@ def measure() -> dict[str, float]:
     everybody = mesh_subset.of_split(data, "train", "validation", "test")
     hierarchy = mesh_hierarchy.build(*makehuman.template()[:2])
     with tempfile.TemporaryDirectory() as folder:
-        fit_s2d_dec.fit(everybody, hierarchy, folder, plan=fit_s2d_dec.Plan(steps=CHUNK * CHUNKS))
+        fit_s2d_dec.fit(everybody, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=CHUNK * CHUNKS))
         lines = Path(folder, "metrics.jsonl").read_text().splitlines()
     first, *steady = [json.loads(line)["seconds"] / CHUNK for line in lines]
     times = {"first_s": CHUNK * first, "min_s": min(steady), "median_s": statistics.median(steady)}

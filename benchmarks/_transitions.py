@@ -100,7 +100,7 @@ def _in_full(motions: augment.Motions, pairs: jax.Array) -> jax.Array:
             )
             return srvf.decode(q, log_length, start)[-1]
 
-        return jax.vmap(frame)(srvf.covered(second.q))
+        return jax.vmap(frame)(srvf.arc_length_fraction(second.q))
 
     return jax.vmap(one)(pairs)
 

@@ -56,7 +56,7 @@ def run(config: Config) -> _measure.Found:
     options = {"repeats": 3 if config.quick else 9, "items": config.compared, "unit": "transitions"}
     rows = [_measure.row(f"transitions_{config.compared}", sides, peers=["NumPy", "decoded in full"], **options)]
     count = config.transitions // 15 if config.quick else config.transitions
-    rows += [_pass(count, pace, sizes) for pace in augment.PACES]
+    rows += [_pass(count, pace, sizes) for pace in augment.TIME_WARPS]
     rows.append(_selection(config))
     return rows, [] if config.quick else _by_size(config, sizes)
 

@@ -44,7 +44,7 @@ class Config(_measure.Options):
 def run(config: Config) -> _measure.Found:
     """Rows of the table."""
     rows, repeats = [], 5 if config.quick else 15
-    data = makehuman4d.prepare() if config.store is None else dataset.open_store(config.store)
+    data = makehuman4d.prepare() if config.store is None else dataset.open_dataset(config.store)
     everybody = mesh_subset.of_split(data, "train")
     read = fit_s2d_dec.mesh_batches(everybody, config.batch, 0)
     first = iter(range(0, 10**9, 10))

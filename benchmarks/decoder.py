@@ -65,7 +65,7 @@ class Config(_measure.Options):
 class Problem(NamedTuple):
     """A decoder and data for it."""
 
-    params: s2d_dec.Params
+    params: s2d_dec.S2DDec
     hierarchy: Hierarchy
     marks: jax.Array  # (B, L, 3)
     target: jax.Array  # (B, N, 3)
@@ -104,7 +104,7 @@ def gflop(hierarchy: Hierarchy, *, batch: int, landmarks: int = 68) -> float:
     return 2e-9 * batch * (3 * landmarks * hierarchy.sizes[-1] * channels[0] + products)
 
 
-def plain(params: s2d_dec.Params, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
+def plain(params: s2d_dec.S2DDec, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
     """`decoder.apply` as one would write it first: (B, L, 3) -> (B, N, 3)."""
     scale, weights = params
     x = ((displacements - scale.landmark_mean) / scale.landmark_std).reshape(len(displacements), -1)
@@ -173,11 +173,11 @@ def training_step(given: Problem) -> tuple[loop.Step, loop.TrainState]:
 
     def loss(trained, key, batch, constants):
         scale, hierarchy, weights = constants
-        predicted = s2d_dec.apply(s2d_dec.Params(scale, trained), hierarchy, batch[0])
+        predicted = s2d_dec.apply(s2d_dec.S2DDec(scale, trained), hierarchy, batch[0])
         return losses.s2d(predicted, batch[1], weights), {}
 
     optimiser = optax.adamw(PLAN["rate"], weight_decay=PLAN["weight_decay"])
-    state = steps.start_supervised(given.params.weights, optimiser, jax.random.key(0))
+    state = steps.init_supervised(given.params.weights, optimiser, jax.random.key(0))
     return steps.supervised(loss, optimiser), state
 
 

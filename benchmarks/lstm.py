@@ -8,7 +8,7 @@ squared error; 204 numbers a frame: 68 landmarks.
 * `lstm_forward`, `lstm_gradient`, `lstm_train_step` of one network, from the same weights and data on both sides. Our
   step is timed in one call of ten, as the training loop has it, and alone as `single`; its batch shared out among the
   cores by `facejax.parallel.data_parallel` where that goes evenly, and then on one device as `one device`.
-* `lstm_train_step_x6`: six networks by `facejax.steps.side_by_side`, shared among the cores, also one after another and
+* `lstm_train_step_x6`: six networks by `facejax.steps.vectorize_models`, shared among the cores, also one after another and
   under `vmap`, beside six steps of PyTorch.
 * `lstm_follow`: the network that reads its own output, beside the automatic gradient of its scan.
 
@@ -126,10 +126,10 @@ def _six(config: Config, batch: int, with_torch: bool, repeats: int) -> _measure
     weights = [_weights(config, i) for i in range(count)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *data)
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *weights)
-    turns = steps.side_by_side(_step(), names, range(count))
+    turns = steps.vectorize_models(_step(), names, range(count))
 
     def beside(step: loop.Step) -> Callable:
-        state = steps.start_side_by_side(together, optax.adam(RATE), jax.random.key(0))
+        state = steps.init_vectorized_models(together, optax.adam(RATE), jax.random.key(0))
         return _work.onward(step, state, stacked, ((), ()))
 
     def apart() -> Callable:
@@ -171,7 +171,7 @@ def _follow(config: Config, batch: int, repeats: int) -> list[_measure.Row]:
     """The network that reads its own output from the start."""
     data, weights = _data(config, batch), _weights(config, 0)
     given = jnp.zeros(data.mask.shape, bool).at[0].set(True)
-    forms = {"facejax": lstm.follow, "automatic": jax.jit(_automatic)}
+    forms = {"facejax": lstm.forward_scheduled, "automatic": jax.jit(_automatic)}
 
     def gradient(form: Callable) -> Callable:
         slope = jax.jit(jax.grad(lambda weights, data: _error(form(weights, data.x, given), data)))
@@ -202,7 +202,7 @@ def _by_size(config: Config) -> list[dict]:
 
 
 def _automatic(weights: lstm.Weights, x: jax.Array, given: jax.Array) -> jax.Array:
-    """`lstm.follow` as a scan of `lstm.step`, which JAX differentiates by itself."""
+    """`lstm.forward_scheduled` as a scan of `lstm.step`, which JAX differentiates by itself."""
 
     def advance(carry, inputs):
         states, last = carry
@@ -210,7 +210,7 @@ def _automatic(weights: lstm.Weights, x: jax.Array, given: jax.Array) -> jax.Arr
         states, out = lstm.step(weights, states, jnp.where(given[:, None], x, last))
         return (states, out), out
 
-    return jax.lax.scan(advance, (lstm.start(weights, x.shape[1]), jnp.zeros_like(x[0])), (x, given))[1]
+    return jax.lax.scan(advance, (lstm.init_states(weights, x.shape[1]), jnp.zeros_like(x[0])), (x, given))[1]
 
 
 def _data(config: Config, count: int, *, seed: int = 0) -> Batch:
@@ -248,7 +248,7 @@ def _shared(batch: int) -> loop.Step | None:
 
 
 def _start(weights: lstm.Weights) -> loop.TrainState:
-    return steps.start_supervised(weights, optax.adam(RATE), jax.random.key(0))
+    return steps.init_supervised(weights, optax.adam(RATE), jax.random.key(0))
 
 
 def _by_name(metrics: dict, names: list[str]) -> list:
@@ -283,5 +283,5 @@ def _step_products(config: Config, batch: int) -> float:
 
 
 if __name__ == "__main__":
-    runtime.every_core()
+    runtime.use_all_cores()
     _measure.main("lstm", Config, run)

@@ -78,14 +78,17 @@ def run(config: Config) -> _measure.Found:
     known = _transitions.made_up(
         config.motions, labels=config.gan.labels, steps=config.gan.steps, landmarks=config.gan.landmarks
     )
-    chart = transitions.chart_of(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
-    examples = transitions.examples_of(chart, [known])
+    chart = transitions.fit_chart(known, labels=config.gan.labels, rank=config.gan.rank, pose=config.gan.pose)
+    examples = transitions.encode_examples(chart, [known])
     gan = handed(fit_motion.fit_gan, examples, chart, plan=config.gan_plan, config=config.gan)
     field = handed(fit_motion.fit_flow, examples, chart, plan=config.flow_plan, config=config.flow)
     rows = [_step("gan_step", gan, config.gan_plan, with_torch, repeats)]
     rows.append(_step("flow_step", field, config.flow_plan, with_torch, repeats))
     rows += _reference(known, chart, config)
-    pairs = {"gan": motion3dgan.Params(chart, gan.state.extra), "flow": flow_matching.Params(chart, field.state.extra)}
+    pairs = {
+        "gan": motion3dgan.Motion3DGAN(chart, gan.state.extra),
+        "flow": flow_matching.FlowMatching(chart, field.state.extra),
+    }
     rows += [_sampling(name, params, config, repeats) for name, params in pairs.items()]
 
     def sized(batch: int) -> Callable:
@@ -137,7 +140,7 @@ def _step(
     )  # fmt: skip
 
 
-def _reference(known: Motions, chart: tangent_pca.Chart, config: Config) -> list[_measure.Row]:
+def _reference(known: Motions, chart: tangent_pca.TangentPCA, config: Config) -> list[_measure.Row]:
     """The step of the GAN as its authors built it, on few samples."""
     plan, rows = fit_motion.REFERENCE._replace(batch=config.reference_batch), []
     for divisor in (config.width_divisor, 1)[: 1 + config.whole]:

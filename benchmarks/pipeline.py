@@ -60,7 +60,7 @@ def run(config: Config) -> _measure.Found:
             name = f"labels_to_meshes{way}_b{samples}"
             rows.append(_measure.row(name, sides, repeats=repeats, items=count, unit="meshes"))
     neutral = models.face.vertices
-    rows.append(_measure.row("new_face", {"facejax": lambda: gpmm.on_face(models.decoder.base, neutral)}, repeats=5))
+    rows.append(_measure.row("new_face", {"facejax": lambda: gpmm.linear_map(models.decoder.base, neutral)}, repeats=5))
     with tempfile.TemporaryDirectory() as folder:
         for name in ("fresh_process_empty_cache", "fresh_process_warm_cache"):
             seconds = _fresh(folder)

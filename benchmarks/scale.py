@@ -83,7 +83,7 @@ def _meshes(config: Config):
 
     def loss(weights, key, batch, constants):
         scale, hierarchy = constants
-        return losses.displacement_l1(s2d_dec.apply(s2d_dec.Params(scale, weights), hierarchy, batch[0]), batch[1]), {}
+        return losses.displacement_l1(s2d_dec.apply(s2d_dec.S2DDec(scale, weights), hierarchy, batch[0]), batch[1]), {}
 
     return loss, params.weights, batch, (params.scale, hierarchy)
 
@@ -106,7 +106,7 @@ def _step(name: str, loss: Callable, weights, batch, constants, axis: int, repea
     shared = sharding.data_parallel(step, axis=axis)
 
     def onward(step: loop.Step) -> Callable:
-        state = steps.start_supervised(weights, optax.adam(1e-3), jax.random.key(0))
+        state = steps.init_supervised(weights, optax.adam(1e-3), jax.random.key(0))
         return _work.onward(step, state, batch, constants)
 
     sides = {"facejax": onward(_work.scanned(shared, SCAN)), "one device": onward(_work.scanned(step, SCAN))}
@@ -156,5 +156,5 @@ def _told(written: list[_measure.Row], count: int) -> _measure.Row:
 
 
 if __name__ == "__main__":
-    runtime.every_core()
+    runtime.use_all_cores()
     _measure.main("scale", Config, run)

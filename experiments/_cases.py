@@ -10,7 +10,7 @@ import numpy as np
 
 from facejax.data import dataset
 from facejax.data.importers import registry
-from facejax.data.mesh_subset import Meshes, of_split
+from facejax.data.mesh_subset import MeshSubset, of_split
 from facejax.data.synthetic import makehuman, makehuman4d, performance
 from facejax.io import cache
 from facejax.mesh import hierarchy, rbf_weights
@@ -26,8 +26,8 @@ class Case(NamedTuple):
 
     split: str
     fold: int
-    train: Meshes
-    test: Meshes
+    train: MeshSubset
+    test: MeshSubset
     by: str  # "subjects" or "labels"
 
     @property
@@ -38,7 +38,7 @@ class Case(NamedTuple):
 
 def data_of(
     path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED
-) -> dataset.Store:
+) -> dataset.Dataset:
     """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
     if path is not None:
         return dataset.open_meshes(path)
@@ -46,7 +46,7 @@ def data_of(
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
 
-def check_alike(a: dataset.Store, b: dataset.Store) -> None:
+def check_alike(a: dataset.Dataset, b: dataset.Dataset) -> None:
     """Raise `ValueError` for two datasets of other triangles or landmarks."""
     for name in ("faces", "landmark_index"):
         if not np.array_equal(getattr(a, name), getattr(b, name)):
@@ -54,12 +54,12 @@ def check_alike(a: dataset.Store, b: dataset.Store) -> None:
             raise ValueError(f"{a.path} and {b.path} have other {what}: both have to be in one topology")
 
 
-def is_makehuman(data: dataset.Store) -> bool:
+def is_makehuman(data: dataset.Dataset) -> bool:
     """Whether the store holds the embedded dataset."""
     return data.index.get("name") == "makehuman4d"
 
 
-def cases(data: dataset.Store, splits: Sequence[str]) -> list[Case]:
+def cases(data: dataset.Dataset, splits: Sequence[str]) -> list[Case]:
     """The folds of each protocol.
 
     `identity`: four folds over the sorted training and validation subjects. `expression`: four over the sorted names of
@@ -88,29 +88,29 @@ def cases(data: dataset.Store, splits: Sequence[str]) -> list[Case]:
     return found
 
 
-def _with_people(data: dataset.Store) -> list[str]:
+def _with_people(data: dataset.Dataset) -> list[str]:
     return [split for split in dataset.SPLITS if len(data.subjects(split))]
 
 
-def _four_folds(people: Meshes, split: str) -> list[Case]:
+def _four_folds(people: MeshSubset, split: str) -> list[Case]:
     by = "subjects" if split == "identity" else "labels"
     if by == "labels" and is_makehuman(people.data):
         people = people.of_labels(performance.COMA)
     return [Case(split, i, fit, held, by) for i, (fit, held) in enumerate(people.folds(FOLDS, by=by))]
 
 
-def _one_fold(people: Meshes, split: str, held: np.ndarray) -> list[Case]:
+def _one_fold(people: MeshSubset, split: str, held: np.ndarray) -> list[Case]:
     return [Case(split, 0, people.where(~held), people.where(held), "subjects" if split == "identity" else "labels")]
 
 
-def _d3dfacs(people: Meshes, split: str) -> list[Case]:
+def _d3dfacs(people: MeshSubset, split: str) -> list[Case]:
     """The last seven subjects train; the first eleven expressions of each are left out."""
     if split == "identity":
         return _one_fold(people, split, ~np.isin(people.owner, people.subjects[-7:]))
     return _one_fold(people, split, _first_of_each(people, 11))
 
 
-def _florence(people: Meshes, split: str) -> list[Case]:
+def _florence(people: MeshSubset, split: str) -> list[Case]:
     """The last 30 women and 10 men, or the first two expressions of each, are left out."""
     if split == "expression":
         return _one_fold(people, split, _first_of_each(people, 2))
@@ -124,14 +124,14 @@ def _florence(people: Meshes, split: str) -> list[Case]:
     return _one_fold(people, split, np.isin(people.owner, held))
 
 
-def _bu3dfe(people: Meshes, split: str) -> list[Case]:
+def _bu3dfe(people: MeshSubset, split: str) -> list[Case]:
     """The first ten subjects, or anger and disgust, are left out."""
     if split == "identity":
         return _one_fold(people, split, np.isin(people.owner, people.subjects[:10]))
     return _one_fold(people, split, np.isin(people.labels, ["angry", "anger", "disgust"]))
 
 
-def _first_of_each(people: Meshes, count: int) -> np.ndarray:
+def _first_of_each(people: MeshSubset, count: int) -> np.ndarray:
     held = np.zeros(people.count, bool)
     for subject in people.subjects:
         mine = people.owner == subject
@@ -142,7 +142,7 @@ def _first_of_each(people: Meshes, count: int) -> np.ndarray:
 _PUBLISHED = {"coma": _four_folds, "d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
 
 
-def at_most(meshes: Meshes) -> Meshes:
+def at_most(meshes: MeshSubset) -> MeshSubset:
     """The meshes, or a fixed draw of 20,000 of them."""
     if meshes.count <= MOST:
         return meshes
@@ -150,21 +150,21 @@ def at_most(meshes: Meshes) -> Meshes:
     return meshes.where(np.isin(np.arange(meshes.count), keep))
 
 
-def regions_of(data: dataset.Store) -> dict[str, np.ndarray]:
+def regions_of(data: dataset.Dataset) -> dict[str, np.ndarray]:
     """The whole head, and the face: 25 mm along the surface about a landmark."""
     if is_makehuman(data):
         mask = makehuman.template().face_mask
     else:
-        mask = rbf_weights.region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
+        mask = rbf_weights.face_region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
     return {"head": np.ones_like(mask), "face": mask}
 
 
-def hierarchy_of(data: dataset.Store) -> hierarchy.Hierarchy:
+def hierarchy_of(data: dataset.Dataset) -> hierarchy.Hierarchy:
     """The levels that spiral networks climb."""
     return hierarchy.build(template_of(data), np.asarray(data.faces), cache=cache.folder())
 
 
-def template_of(data: dataset.Store) -> np.ndarray:
+def template_of(data: dataset.Dataset) -> np.ndarray:
     """The face on which tables are made: makehuman4d's own, else the mean of the training subjects."""
     if is_makehuman(data):
         return makehuman.template().vertices

@@ -87,7 +87,7 @@ def options_of(case: Case, mode: Mode, seed: int, hierarchy: hierarchy.Hierarchy
         return options._replace(**plans)
     epochs = 300 * case.train.count
     steps = {
-        "decoder": fit_s2d_dec.Plan, "residual": fit_residual.Plan, "neural3dmm": fit_neural3dmm.Plan,
+        "decoder": fit_s2d_dec.S2DDecPlan, "residual": fit_residual.ResidualPlan, "neural3dmm": fit_neural3dmm.Neural3DMMPlan,
     }  # fmt: skip
     for name, plan in steps.items():
         chosen = plan()
@@ -196,7 +196,7 @@ def _write(folder: Path, key: str, found: dict[float, Result]) -> None:
               for field, value in result.distances._asdict().items()}  # fmt: skip
     first = next(iter(found.values()))
     about = json.dumps({"key": key, "seconds": first.seconds, "about": first.about})
-    with atomic.replacing(folder / "distances.npz") as temporary, open(temporary, "wb") as file:
+    with atomic.replace_file(folder / "distances.npz") as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, about=np.array(about), **arrays)
 
 
@@ -230,7 +230,7 @@ def drawn(figure: Any, path: Path) -> Path:
     from matplotlib import pyplot
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         figure.savefig(temporary, dpi=110, format="png")
     pyplot.close(figure)
     return path

@@ -31,7 +31,7 @@ class Walk(NamedTuple):
     tau: np.ndarray  # (K, T): the share of the way that each frame has gone
 
 
-def joined(data: dataset.Store, splits: Sequence[str], only=motions.halves) -> motions.Motions:
+def joined(data: dataset.Dataset, splits: Sequence[str], only=motions.halves) -> motions.Motions:
     """`motions.halves` or `motions.directs` of several splits."""
     return motions.join(*(only(data, split) for split in splits))
 
@@ -61,7 +61,7 @@ def walk(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> Walk
     (q1, length1), (q2, length2) = (srvf.encode(jnp.asarray(x)) for x in (first, second))
     time = np.linspace(0, 1, frames, dtype=np.float32)
     if pace == "performed":
-        tau = np.asarray(srvf.covered(q2))
+        tau = np.asarray(srvf.arc_length_fraction(q2))
     else:
         tau = np.tile(time if pace == "even" else time**3 * (10 - 15 * time + 6 * time**2), (len(first), 1))
     if path == "sphere":
@@ -71,7 +71,7 @@ def walk(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> Walk
     return Walk((1 - share) * first[:, None, -1] + share * second[:, None, -1], tau)
 
 
-def again(data: dataset.Store, found: motions.Motions, *, take: int = 1) -> motions.Motions:
+def again(data: dataset.Dataset, found: motions.Motions, *, take: int = 1) -> motions.Motions:
     """Direct transitions performed by the same people once more. They are not in the dataset: it has take 0."""
     spec = data.index["spec"]
     curves = np.zeros_like(found.curves)

@@ -79,7 +79,7 @@ def _plot_onsets(axis, onsets: dict[str, Any]) -> None:
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0.1, 0.88))
 
 
-def sheet(path: Path, data: dataset.Store, walks, direct: motions.Motions) -> None:
+def sheet(path: Path, data: dataset.Dataset, walks, direct: motions.Motions) -> None:
     """After OT23's Fig. 4, in landmarks: one transition in three ways, and the direct one, which is grey behind them.
 
     Which transition: at the performed pace on the sphere, a tenth of all are farther from the direct one.

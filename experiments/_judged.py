@@ -81,7 +81,7 @@ def models_of(config: Options) -> list[pipeline.Models]:
     return found
 
 
-def fits(models: pipeline.Models, data: dataset.Store, path: Path | str) -> None:
+def fits(models: pipeline.Models, data: dataset.Dataset, path: Path | str) -> None:
     """Raise `ValueError` for models that were made for other labels, triangles or landmarks than the dataset's."""
     mesh = models.face
     if models.labels != data.labels:
@@ -96,14 +96,14 @@ def fits(models: pipeline.Models, data: dataset.Store, path: Path | str) -> None
         )
 
 
-def data_of(config: People) -> dataset.Store:
+def data_of(config: People) -> dataset.Dataset:
     """The dataset that generators are trained on."""
     if config.data is not None:
-        return dataset.open_store(config.data)
+        return dataset.open_dataset(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
 
 
-def names_of(data: dataset.Store) -> tuple[Names, ...]:
+def names_of(data: dataset.Dataset) -> tuple[Names, ...]:
     """The pairs that are judged: OT23's 39 on makehuman4d, else all that can be made of the labels."""
     if _cases.is_makehuman(data):
         return makehuman4d.PAIRS
@@ -148,7 +148,7 @@ def held(config: People, group: str, names: Sequence[Names]) -> Held:
     seconds = [found.seconds[(found.start == a) & (found.end == b)] for a, b in pairs]
     # Of the half that stands for "real", so that it is never compared with itself.
     halves = [np.zeros(len(c) // 2, int) for c in curves]
-    one = [np.argmax(augment.one_of_each(half, half, seed=1)) for half in halves]
+    one = [np.argmax(augment.sample_per_pair(half, half, seed=1)) for half in halves]
     reference = [c[i] for c, i in zip(curves, one, strict=True)]
     return Held(pairs, list(names), curves, seconds, reference, people, scale)
 
@@ -182,7 +182,7 @@ def seconds(models: pipeline.Models, held: Held, *, samples: int, seed: int) -> 
     """How long the motions of `drawn` take."""
     found = []
     for pair, key in zip(held.pairs, jax.random.split(jax.random.key(seed), len(held.pairs)), strict=True):
-        keys, pairs = composition.keys_of(key, samples), composition.pairs_of(pair)
+        keys, pairs = composition.sample_keys(key, samples), composition.label_pairs(pair)
         found.append(np.exp(np.asarray(composition.draw(models.motion, models.starts, keys, pairs).log_seconds[:, 0])))
     return found
 

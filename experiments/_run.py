@@ -37,7 +37,7 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
     if "meshes" in {field.name for field in dataclasses.fields(config_type)}:
         description += f"\n{PREPARES}"
     config = tyro.cli(config_type, prog=f"python -m experiments.{name}", description=description)
-    runtime.start()
+    runtime.configure()
     try:
         _check_publish(config)
         run(config)
@@ -103,7 +103,7 @@ def finish(
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
         write_text(RESULTS / f"{name}.md", body)
         if figure is not None:
-            with atomic.replacing(RESULTS / f"{name}{figure.suffix}") as temporary:
+            with atomic.replace_file(RESULTS / f"{name}{figure.suffix}") as temporary:
                 temporary.write_bytes(figure.read_bytes())
 
 
@@ -119,7 +119,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 def write_text(path: Path, text: str) -> None:
     """Write a file as a whole or not at all."""
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text(text)
 
 

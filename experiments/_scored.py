@@ -107,7 +107,7 @@ def plot(path: Path, judged: dict[str, dict]) -> Path:
     return path
 
 
-def sheet(path: Path, networks: expressions.Expressions, data: dataset.Store | None = None) -> None:
+def sheet(path: Path, networks: expressions.Expressions, data: dataset.Dataset | None = None) -> None:
     """Each network's own expression on one unseen face, by radial basis functions; SL21, Fig. 5.
 
     A MakeHuman face, or the last one of a dataset.
@@ -121,12 +121,12 @@ def sheet(path: Path, networks: expressions.Expressions, data: dataset.Store | N
         rest = np.asarray(data.neutral).mean(axis=0)
     face = retarget.prepare(shown, faces, shown[index], rest[index])
     teeth, rows = eyes_teeth.Props(shape.vertices[shape.landmarks], *makehuman.template_props()), []
-    camera = render.aim(face.vertices, size=PICTURE, turn=15)
+    camera = render.fit_camera(face.vertices, size=PICTURE, turn=15)
     for label in networks.labels:
         curve = np.asarray(expressions.displacements(networks, label, face.landmarks))
         chosen = curve[np.linspace(0, len(curve) - 1, FRAMES).round().astype(int)]
         marks = np.asarray(retarget.landmarks_of(face, chosen))
         parts = eyes_teeth.parts(teeth, face.landmarks, marks)
-        moved = np.asarray(retarget.move(face, chosen))
+        moved = np.asarray(retarget.animate(face, chosen))
         rows.append(render.frames(moved, face.faces, size=PICTURE, camera=camera, extras=parts))
     render.save(path, render.contact_sheet(rows, row_labels=list(networks.labels)))

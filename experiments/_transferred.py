@@ -28,7 +28,7 @@ class Take(NamedTuple):
 
 def posed(recording: livelink.Recording, person: makehuman.Subject, index: np.ndarray) -> Take:
     """A MakeHuman person under a recording that is evenly sampled."""
-    return of_skin(motion_sources.posed(recording, person)[:, : len(person.vertices)], person, index)
+    return of_skin(motion_sources.animate_person(recording, person)[:, : len(person.vertices)], person, index)
 
 
 def of_skin(skin: np.ndarray, person: makehuman.Subject, index: np.ndarray) -> Take:
@@ -36,7 +36,7 @@ def of_skin(skin: np.ndarray, person: makehuman.Subject, index: np.ndarray) -> T
     return Take(person.name, person.vertices, (skin - person.vertices)[:, index], np.arange(len(skin)), skin)
 
 
-def stored(data: dataset.Store, subject: int, label: str) -> Take | None:
+def stored(data: dataset.Dataset, subject: int, label: str) -> Take | None:
     """A subject's first recording under a label of which there are meshes; None where there is none."""
     for sequence in data.sequences:
         if (sequence.subject, sequence.label) == (subject, label):
@@ -46,7 +46,7 @@ def stored(data: dataset.Store, subject: int, label: str) -> Take | None:
     return None
 
 
-def of_sequence(data: dataset.Store, sequence: dataset.Sequence) -> Take:
+def of_sequence(data: dataset.Dataset, sequence: dataset.Sequence) -> Take:
     """A recording of a dataset, with the meshes of it that were drawn."""
     rest = np.asarray(data.neutral[sequence.subject])
     rows = slice(sequence.start, sequence.start + sequence.frames)

@@ -46,7 +46,7 @@ class Face(NamedTuple):
     vertices: np.ndarray  # (n, N, 3) displacements
 
 
-def regions_of(data: dataset.Store) -> dict[str, np.ndarray]:
+def regions_of(data: dataset.Dataset) -> dict[str, np.ndarray]:
     """Vertices of the head, of the face region, and on makehuman4d of the boundary's loops."""
     found = {name: np.flatnonzero(mask) for name, mask in _cases.regions_of(data).items()}
     if not _cases.is_makehuman(data):
@@ -61,14 +61,14 @@ def still(neutral: np.ndarray, faces: np.ndarray, marks: np.ndarray) -> Face:
     """A face at rest, with no motion."""
     rbf_weights.check(marks, neutral)
     factor = rbf_weights.falloff(neutral, faces, marks)
-    share = rbf_weights.side(neutral, faces, marks, rbf_weights.IBUG_LIPS)
+    share = rbf_weights.upper_lip_share(neutral, faces, marks, rbf_weights.IBUG_LIPS)
     return Face(neutral, faces, marks, factor, share, np.zeros((0, *marks.shape)), np.zeros((0, *neutral.shape)))
 
 
 def weights(form: Form, face: Face) -> np.ndarray:
     """(N, L) for `rbf.warp`: those of `attachment.weights`, or with less of what it adds."""
     if form.lips:
-        found = rbf_weights.parted(face.neutral, face.marks, rbf_weights.IBUG_LIPS, face.share, **form.options)
+        found = rbf_weights.split_lips(face.neutral, face.marks, rbf_weights.IBUG_LIPS, face.share, **form.options)
     else:
         found = rbf.weights(rbf.fit(face.marks, **form.options), face.neutral)
     return found * face.factor[:, None] if form.falloff else found
@@ -90,7 +90,7 @@ def remeshed(face: Face, seed: int) -> Face:
     return rest._replace(landmarks=face.landmarks, vertices=moved[:, used])
 
 
-def sequence(data: dataset.Store, form: Form) -> np.ndarray:
+def sequence(data: dataset.Dataset, form: Form) -> np.ndarray:
     """After SL21's figure 4: landmarks over a mesh at rest, the meshes that they make of it, and the true ones."""
     shown, take = _performed(data) if _cases.is_makehuman(data) else _recorded(data)
     face, moved = _resting(data, take.rest), take.landmarks[take.at]
@@ -104,7 +104,7 @@ def sequence(data: dataset.Store, form: Form) -> np.ndarray:
     return render.contact_sheet(rows, row_labels=["landmarks", "warped", "true"], column_labels=labels)
 
 
-def _performed(data: dataset.Store) -> tuple[np.ndarray, _transferred.Take]:
+def _performed(data: dataset.Dataset) -> tuple[np.ndarray, _transferred.Take]:
     """Seven frames of the first test subject's surprise, on makehuman4d; its rig makes their meshes."""
     subject, spec = int(data.subjects("test")[0]), data.index["spec"]
     person = makehuman.subject(subject, seed=spec["seed"])
@@ -115,14 +115,14 @@ def _performed(data: dataset.Store) -> tuple[np.ndarray, _transferred.Take]:
     return shown, _transferred.of_skin(skin, person, data.landmark_index)
 
 
-def _recorded(data: dataset.Store) -> tuple[np.ndarray, _transferred.Take]:
+def _recorded(data: dataset.Dataset) -> tuple[np.ndarray, _transferred.Take]:
     """Up to seven frames that have meshes, of a test subject's first recording."""
     take = _transferred.of_sequence(data, _first(data))
     some = np.unique(np.linspace(0, len(take.at) - 1, 7).round().astype(int))
     return take.at[some], take._replace(at=take.at[some], vertices=take.vertices[some])
 
 
-def _first(data: dataset.Store) -> dataset.Sequence:
+def _first(data: dataset.Dataset) -> dataset.Sequence:
     """The first test subject's anger, or another expression of which there are meshes."""
     mine = [s for s in data.sequences if s.subject in data.subjects("test")[:1] and ">" not in s.label]
     for sequence in sorted(mine, key=lambda s: s.label != PAPERS):
@@ -131,7 +131,7 @@ def _first(data: dataset.Store) -> dataset.Sequence:
     raise ValueError(f"{data.path}: expected recordings of a test subject with meshes")
 
 
-def others(data: dataset.Store, form: Form, odd: Face) -> np.ndarray:
+def others(data: dataset.Dataset, form: Form, odd: Face) -> np.ndarray:
     """After SL21's figure 6: the anger of one test subject on other faces, one of another connectivity."""
     sequence = _first(data)
     take = _transferred.of_sequence(data, sequence)
@@ -148,14 +148,14 @@ def others(data: dataset.Store, form: Form, odd: Face) -> np.ndarray:
     return render.contact_sheet(rows, row_labels=names, column_labels=[f"frame {t + 1}" for t in shown])
 
 
-def heat(data: dataset.Store, errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
+def heat(data: dataset.Dataset, errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
     """Errors (N,) by name on the average face, from the front and from the side; mm."""
     mean, faces, size = _cases.template_of(data), np.asarray(data.faces), (240, 300)
     rows = [
         [
             render.image(
-                mean, faces, size=size, colours=render.heat(values, high=high),
-                camera=render.aim(mean, size=size, turn=turn),
+                mean, faces, size=size, colours=render.heat_colours(values, high=high),
+                camera=render.fit_camera(mean, size=size, turn=turn),
             )
             for values in errors.values()
         ]
@@ -164,7 +164,7 @@ def heat(data: dataset.Store, errors: dict[str, np.ndarray], *, high: float = 2.
     return render.contact_sheet(rows, column_labels=[f"{name}, 0 to {high:g} mm" for name in errors])
 
 
-def _resting(data: dataset.Store, neutral: np.ndarray) -> Face:
+def _resting(data: dataset.Dataset, neutral: np.ndarray) -> Face:
     neutral = np.asarray(neutral)
     return still(neutral, np.asarray(data.faces), neutral[data.landmark_index])
 
@@ -182,7 +182,7 @@ def _pictures(face: Face, vertices: np.ndarray, moved: np.ndarray, *, dots: bool
         vertices,
         face.faces,
         size=PICTURE,
-        camera=render.aim(face.neutral * 1.04, size=PICTURE, turn=18),
+        camera=render.fit_camera(face.neutral * 1.04, size=PICTURE, turn=18),
         landmarks=marks if dots else None,
         extras=eyes_teeth.parts(props, face.marks, marks),
     )

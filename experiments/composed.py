@@ -89,7 +89,7 @@ def run(config: Config) -> dict[str, Any]:
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("composed", config, found, made=made, table=_table(found), figure=figure)
     if config.publish:
-        with atomic.replacing(_run.RESULTS / "composed_chain.png") as temporary:
+        with atomic.replace_file(_run.RESULTS / "composed_chain.png") as temporary:
             temporary.write_bytes((config.out / "chain.png").read_bytes())
     return found
 
@@ -147,8 +147,8 @@ def _joints(models: pipeline.Models, key, labels, drawn: np.ndarray, scale: floa
         bend = np.linalg.norm(np.diff(curves, n=2, axis=1), axis=-1).mean(axis=-1)
         return float(bend[:, at].mean() / np.delete(bend, at, axis=1).mean())
 
-    pairs = composition.pairs_of(pipeline.label_indices(models, labels))
-    keys = composition.keys_of(key, len(drawn))
+    pairs = composition.label_pairs(pipeline.label_indices(models, labels))
+    keys = composition.sample_keys(key, len(drawn))
     curves = scale * np.asarray(composition.draw(models.motion, models.starts, keys, pairs).curves)
     gaps = np.abs(curves[:, 1:, 0] - curves[:, :-1, -1]).max()
     plain = np.concatenate([curves[:, 0], *(curves[:, i, 1:] for i in range(1, curves.shape[1]))], axis=1)

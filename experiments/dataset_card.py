@@ -76,7 +76,7 @@ def run(config: Config) -> dict[str, Any]:
         _farthest(config.out / "expressions.png", data)
     if config.publish and config.data is None:
         for name in ("expressions", "levels"):
-            with atomic.replacing(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
+            with atomic.replace_file(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
                 temporary.write_bytes((config.out / f"{name}.png").read_bytes())
     metrics = {"levels": levels, "speed_mm_per_s": _quantiles(histogram)}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
@@ -84,7 +84,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _counts(data: dataset.Store) -> dict[str, Any]:
+def _counts(data: dataset.Dataset) -> dict[str, Any]:
     direct = sum(">" in s.label for s in data.sequences)
     at, owner = data.meshes("test")
     moved = np.linalg.norm(data.vertices[at] - data.neutral[owner], axis=-1)
@@ -100,7 +100,7 @@ def _counts(data: dataset.Store) -> dict[str, Any]:
     }
 
 
-def _linear_errors(data: dataset.Store) -> dict[str, Any]:
+def _linear_errors(data: dataset.Dataset) -> dict[str, Any]:
     """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on a fourth of them that is unseen."""
     regions = _cases.regions_of(data)
     train, test = of_split(data, "train"), of_split(data, "test")
@@ -122,7 +122,7 @@ def _linear_errors(data: dataset.Store) -> dict[str, Any]:
     return {"error_mm": found}
 
 
-def _speeds(data: dataset.Store) -> np.ndarray:
+def _speeds(data: dataset.Dataset) -> np.ndarray:
     """Mean speed of the landmarks in mm/s, of every frame of every expression."""
     speeds = []
     for s in data.sequences:
@@ -167,7 +167,7 @@ def _sheet(path: Path, config: Config) -> None:
     render.save(path, np.concatenate(sheets))
 
 
-def _farthest(path: Path, data: dataset.Store) -> None:
+def _farthest(path: Path, data: dataset.Dataset) -> None:
     """Of up to five people and nine labels of a dataset, the mesh that is farthest from neutral."""
     labels, at, faces = data.row_labels()[data.drawn], data.row_subjects()[data.drawn], np.asarray(data.faces)
     names, people = sorted(set(labels))[:9], np.unique(at)[:5]
@@ -178,7 +178,9 @@ def _farthest(path: Path, data: dataset.Store) -> None:
             mine = np.flatnonzero((at == person) & (labels == name))
             moved = np.linalg.norm(data.vertices[mine] - rest, axis=-1).mean(axis=-1)
             shown = data.vertices[mine[moved.argmax()]] if len(mine) else rest
-            row.append(render.image(shown, faces, size=PICTURE, camera=render.aim(rest * 1.08, size=PICTURE, turn=18)))
+            row.append(
+                render.image(shown, faces, size=PICTURE, camera=render.fit_camera(rest * 1.08, size=PICTURE, turn=18))
+            )
         rows.append(row)
     known = [data.index["subjects"][person]["name"] for person in people]
     render.save(path, render.contact_sheet(rows, row_labels=known, column_labels=names))
@@ -197,7 +199,7 @@ def _ladder(path: Path, config: Config) -> None:
 def _portrait(vertices: np.ndarray) -> np.ndarray:
     """A picture of a posed head (M, 3) with its own eyes and teeth."""
     shape = makehuman.template()
-    camera = render.aim(shape.vertices * 1.08, size=PICTURE, turn=18)
+    camera = render.fit_camera(shape.vertices * 1.08, size=PICTURE, turn=18)
     skin, parts = vertices[None, : len(shape.vertices)], makehuman_portrait.parts(vertices[None])
     return render.frames(skin, shape.faces, size=PICTURE, camera=camera, extras=parts)[0]
 

@@ -120,9 +120,9 @@ def run(config: Config) -> dict[str, Any]:
         expressions.save(path, networks)
     figure = _scored.plot(config.out / "expression_lstm.png", judged)
     shown = expressions.load(config.out / expressions.RELEASED)
-    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else dataset.open_store(config.data))
+    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else dataset.open_dataset(config.data))
     if config.publish:
-        with atomic.replacing(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
+        with atomic.replace_file(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
     text = f"Chosen: {name}.\n\n{_scored.test_table(judged)}\n\n{_scored.variants_table(table, seconds)}"
     _run.finish("expression_lstm", config, metrics, made=made, table=text, figure=figure)
@@ -145,14 +145,14 @@ def chosen(table: dict[str, dict[str, dict[str, float]]]) -> str:
     return min(within, key=lambda name: np.mean([_scored.ratios(row)["rest"] for row in table[name].values()]))
 
 
-def train(config: Config, name: str) -> expression_lstm.Params:
+def train(config: Config, name: str) -> expression_lstm.ExpressionLSTM:
     """The stacked networks of a variant."""
     variant = VARIANTS[name]
     data = _dataset(config, variant)
     plan = variant.plan if config.steps is None else variant.plan._replace(steps=config.steps)
     learnt_from = recordings(config, variant, "train")
     return fit_expression_lstm.fit(
-        sequences.join(learnt_from, sequences.mirrored(learnt_from)) if variant.mirror else learnt_from,
+        sequences.join(learnt_from, sequences.mirror(learnt_from)) if variant.mirror else learnt_from,
         folder(config, name),
         labels={label: data.labels.index(label) for label in labels_of(data)},
         plan=plan,
@@ -174,7 +174,7 @@ def recordings(config: Config, variant: Variant, split: str) -> sequences.Sequen
     return sequences.without_head_motion(found) if variant.head == "removed" else found
 
 
-def labels_of(data: dataset.Store) -> tuple[str, ...]:
+def labels_of(data: dataset.Dataset) -> tuple[str, ...]:
     """What there is a network for: the six emotions, or all expressions of a dataset of the user's own."""
     return performance.EMOTIONS if _cases.is_makehuman(data) else data.labels[1:]
 
@@ -188,14 +188,14 @@ def _spec(config: Config, variant: Variant) -> makehuman4d.Spec:
     return makehuman4d.Spec(config.level, config.subjects, config.meshes, head_motion=variant.head != "none")
 
 
-def _dataset(config: Config, variant: Variant) -> dataset.Store:
+def _dataset(config: Config, variant: Variant) -> dataset.Dataset:
     if config.data is not None:
-        return dataset.open_store(config.data)
+        return dataset.open_dataset(config.data)
     return makehuman4d.prepare(_spec(config, variant))
 
 
 def scores(
-    config: Config, variant: Variant, params: expression_lstm.Params, splits: tuple[str, ...]
+    config: Config, variant: Variant, params: expression_lstm.ExpressionLSTM, splits: tuple[str, ...]
 ) -> dict[str, dict]:
     """`evaluation.expression_scores` of each emotion; all `splits` together, the first where heads move."""
     data = _dataset(config, variant)
@@ -211,11 +211,11 @@ def scores(
     return found
 
 
-def _networks(config: Config, variant: Variant, params: expression_lstm.Params) -> expressions.Expressions:
+def _networks(config: Config, variant: Variant, params: expression_lstm.ExpressionLSTM) -> expressions.Expressions:
     frames, data = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL, _dataset(config, variant)
     return expressions.Expressions(labels_of(data), params, variant.config, float(data.index["rate"]), frames, {})
 
 
 if __name__ == "__main__":
-    runtime.every_core()
+    runtime.use_all_cores()
     _run.main("expression_lstm", Config, run)

@@ -61,7 +61,7 @@ def run(config: Config) -> dict[str, Any]:
             marks = case.test.read(np.array([row]))[0]
             made = baselines.METHODS[name].apply(fitted, marks, rest)[0]
             error = np.linalg.norm(made - vertices, axis=-1)
-            column.append(_face(data, made, render.heat(error, high=config.high)))
+            column.append(_face(data, made, render.heat_colours(error, high=config.high)))
             rows.append({"method": name, "label": str(case.test.labels[row]), "mean_mm": float(error.mean()),
                          "largest_mm": float(error.max())})  # fmt: skip
         columns.append(column)
@@ -96,7 +96,7 @@ def _true(test, row: int) -> np.ndarray:
 
 
 def _face(data, vertices: np.ndarray, colours: np.ndarray | None = None) -> np.ndarray:
-    camera = render.aim(vertices * 1.05, size=PICTURE, turn=18)
+    camera = render.fit_camera(vertices * 1.05, size=PICTURE, turn=18)
     look = {} if colours is None else {"colours": colours}
     return render.image(vertices, np.asarray(data.faces), size=PICTURE, camera=camera, **look)
 

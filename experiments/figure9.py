@@ -92,7 +92,7 @@ def run(config: Config) -> dict[str, Any]:
         still = np.broadcast_to(take.rest, vertices.shape)
         mean, at_rest = (float(_transferred.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still))
         errors.append({"target": take.name, "mean_mm": mean, "still_mm": at_rest})
-    outputs.writable(config.out)
+    outputs.make_output_folder(config.out)
     rows = []
     for name, (take, vertices, marks) in films.items():
         extras = eyes_teeth.parts(eyes_teeth.template(), take.rest[index], marks)
@@ -154,7 +154,7 @@ def _dataset(models: pipeline.Models) -> dict[str, Any]:
 def _pictures(models, rest, vertices, extras) -> np.ndarray:
     shown = np.linspace(0, len(vertices) - 1, SHOWN).round().astype(int)
     parts = [part._replace(vertices=part.vertices[shown]) if part.vertices.ndim == 3 else part for part in extras]
-    camera = render.aim(rest * 1.08, size=PICTURE, turn=18)
+    camera = render.fit_camera(rest * 1.08, size=PICTURE, turn=18)
     return render.frames(vertices[shown], models.face.faces, size=PICTURE, camera=camera, extras=parts)
 
 

@@ -143,11 +143,11 @@ def _examples(data, source: str) -> tuple[motions.Motions, Any, transitions.Exam
     labels = len(data.labels)
     if source == "prototypes":
         known = transitions.transitions(data, "train")
-        chart = transitions.chart_of(known, labels=labels, rank=transitions.rank_of(known))
-        return known, chart, transitions.examples_of(chart, [known])
-    known = motions.join(*transitions.everything(data, "train", per_pair=transitions.CHARTED))
-    chart = transitions.chart_of(known, labels=labels, rank=transitions.rank_of(known))
-    return known, chart, transitions.examples_of(chart, transitions.everything(data, "train"))
+        chart = transitions.fit_chart(known, labels=labels, rank=transitions.default_rank(known))
+        return known, chart, transitions.encode_examples(chart, [known])
+    known = motions.join(*transitions.all_pairs(data, "train", per_pair=transitions.CHARTED))
+    chart = transitions.fit_chart(known, labels=labels, rank=transitions.default_rank(known))
+    return known, chart, transitions.encode_examples(chart, transitions.all_pairs(data, "train"))
 
 
 def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.Models, path: Path) -> None:

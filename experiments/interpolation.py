@@ -86,21 +86,21 @@ def run(config: Config) -> dict[str, Any]:
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("interpolation", config, metrics, made=made, table=_table(metrics, config.noise), figure=figure)
     if config.publish:
-        with atomic.replacing(_run.RESULTS / "interpolation_sheet.png") as temporary:
+        with atomic.replace_file(_run.RESULTS / "interpolation_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
     return metrics
 
 
-def _data(config: Config) -> dataset.Store:
+def _data(config: Config) -> dataset.Dataset:
     if config.data is None:
         return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
-    data = dataset.open_store(config.data)
+    data = dataset.open_dataset(config.data)
     if not _cases.is_makehuman(data):
         raise ValueError(f"{data.path}: only makehuman4d has transitions that were performed from peak to peak")
     return data
 
 
-def _onsets(config: Config, data: dataset.Store, onsets: motions.Motions) -> dict[str, Any]:
+def _onsets(config: Config, data: dataset.Dataset, onsets: motions.Motions) -> dict[str, Any]:
     """Between the onsets of two people; real ones are sought among the training subjects'."""
     scale = float(onsets.scale.mean())
     pool = made_of.onsets_of(motions.halves(data, "train"))
@@ -135,7 +135,7 @@ def _walks(onsets: motions.Motions, direct: motions.Motions) -> dict[tuple[str, 
     return {(path, pace): made_of.walk(first, second, path=path, pace=pace) for path, pace in WAYS}
 
 
-def _peaks(config: Config, data: dataset.Store, walks, direct: motions.Motions) -> dict[str, Any]:
+def _peaks(config: Config, data: dataset.Dataset, walks, direct: motions.Motions) -> dict[str, Any]:
     """Every way from peak to peak against the direct one; and another take of it."""
     scale = float(direct.scale.mean())
     found = {made_of.name(way): made_of.against(walk, direct, scale) for way, walk in walks.items()}
@@ -159,7 +159,7 @@ def _peaks(config: Config, data: dataset.Store, walks, direct: motions.Motions) 
     return {"ways": found, "another_take": twice, "paired": nearer, "direct_detour": straight}
 
 
-def _recognition(config: Config, data: dataset.Store, direct: motions.Motions) -> dict[str, float]:
+def _recognition(config: Config, data: dataset.Dataset, direct: motions.Motions) -> dict[str, float]:
     """Forests that learn OT23's set (halves, and selected transitions) made in each way, and see direct ones."""
     pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in makehuman4d.PAIRS]
     halves = motions.halves(data, "train")

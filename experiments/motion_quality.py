@@ -56,7 +56,7 @@ def run(config: Config) -> dict[str, Any]:
     models = pipeline.load(config.model)
     _judged.fits(models, data, config.model or "the released models")
     held_out = [split for split in ("validation", "test") if len(data.subjects(split))]
-    real = motions.join(*(part for split in held_out for part in transitions.everything(data, split, per_pair=20)))
+    real = motions.join(*(part for split in held_out for part in transitions.all_pairs(data, split, per_pair=20)))
     pairs = sorted(set(zip(real.start.tolist(), real.end.tolist(), strict=True)))
     keys = jax.random.split(jax.random.key(config.seed), len(pairs))
     trained_on = motions.halves(data, "train")

@@ -70,7 +70,7 @@ def run(config: Config) -> dict[str, Any]:
         for split in config.splits:
             case = _cases.cases(data, [split])[0]
             where = {"level": level, "noise_mm": noise, "split": split}
-            plans = {} if mode != "default" else {"decoder": fit_s2d_dec.Plan(steps=config.steps)}
+            plans = {} if mode != "default" else {"decoder": fit_s2d_dec.S2DDecPlan(steps=config.steps)}
             options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
             folder = config.folder() / f"level{level}-noise{noise:g}"
             for name in config.methods:
@@ -113,16 +113,16 @@ def _told_and_floor(case, options: baselines.Options, regions) -> dict[float, _d
     ridge = baselines.METHODS["ridge"].fit(case.train, Path(), options).params
     floors, told = _floors(case, fitted.params, ridge, regions), {}
     for noise in LANDMARK_NOISE:
-        params = gpmm.told(fitted.params, noise)
+        params = gpmm.with_landmark_noise(fitted.params, noise)
         distances = vertex_error.distances(
-            lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.on_face(p, rest), marks)),
+            lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.linear_map(p, rest), marks)),
             case.test, regions, noise=noise,
         )  # fmt: skip
         told[noise] = _dense.Result(distances, 0.0, floors)
     return told
 
 
-def _floors(case, base: gpmm.Params, ridge: linear.Params, regions: dict[str, np.ndarray]) -> dict[str, Any]:
+def _floors(case, base: gpmm.GPMM, ridge: linear.LinearMap, regions: dict[str, np.ndarray]) -> dict[str, Any]:
     test = case.test.thin(max(1, case.test.count // 2_000))
     marks, vertices = (np.concatenate(part) for part in zip(*test, strict=True))
     recording = test.recordings
@@ -130,12 +130,12 @@ def _floors(case, base: gpmm.Params, ridge: linear.Params, regions: dict[str, np
     with_face = np.empty_like(vertices)
     for subject in test.subjects:
         mine = test.owner == subject
-        one = gpmm.on_face(base, test.data.neutral[subject])
+        one = gpmm.linear_map(base, test.data.neutral[subject])
         with_face[mine] = vertices[mine] - np.asarray(linear.apply(one, marks[mine]))
     found = {
-        "landmarks": noise_floor.estimate(alone, *noise_floor.pairs(marks, test.owner)),
+        "landmarks": noise_floor.estimate(alone, *noise_floor.nearest_pairs(marks, test.owner)),
         "landmarks and face": noise_floor.estimate(
-            with_face, *noise_floor.pairs(marks, test.owner, apart=recording, alike=True)
+            with_face, *noise_floor.nearest_pairs(marks, test.owner, apart=recording, alike=True)
         ),
     }
     return {

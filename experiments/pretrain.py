@@ -117,7 +117,7 @@ def run(config: Config) -> dict[str, Any]:
         pipeline.save(PACKAGED, models)
     size = (config.out / bundle.RELEASED).stat().st_size / 1e6
     rows = [
-        ("landmarks to mesh", "S2D-Dec" if isinstance(decode, s2d_dec.Params) else "carried GPMM, refined"),
+        ("landmarks to mesh", "S2D-Dec" if isinstance(decode, s2d_dec.S2DDec) else "carried GPMM, refined"),
         ("mean vertex error on test subjects, whole head", f"{metrics['error_mm']['head']:.4f} mm"),
         ("the same, face region", f"{metrics['error_mm']['face']:.4f} mm"),
         ("generator of motion", generators.kind(models.motion)),
@@ -145,8 +145,8 @@ def _taken(path: Path, network: str) -> dict[str, Any]:
     return about.get("plans", {}).get(network) or known
 
 
-def _plan(config: Config) -> fit_s2d_dec.Plan | fit_residual.Plan:
-    plan = fit_s2d_dec.Plan() if config.meshes_by == bundle.S2D else fit_residual.Plan()
+def _plan(config: Config) -> fit_s2d_dec.S2DDecPlan | fit_residual.ResidualPlan:
+    plan = fit_s2d_dec.S2DDecPlan() if config.meshes_by == bundle.S2D else fit_residual.ResidualPlan()
     return plan if config.decoder_steps is None else plan._replace(steps=config.decoder_steps)
 
 
@@ -156,13 +156,13 @@ def _decoder_about(config: Config) -> dict[str, Any]:
     return {"kind": config.meshes_by} | _plan(config)._asdict()
 
 
-def _names(config: Config, data: dataset.Store) -> tuple[str, ...]:
+def _names(config: Config, data: dataset.Dataset) -> tuple[str, ...]:
     if config.motion is not None:
         return pipeline.load(config.motion).labels
     return data.labels if config.labels == "all" else (performance.NEUTRAL, *performance.COMA)
 
 
-def _motion(config: Config, data: dataset.Store):
+def _motion(config: Config, data: dataset.Dataset):
     """The generator, the peaks that motions start from, and the seconds it took."""
     if config.motion is not None:
         found = pipeline.load(config.motion)
@@ -173,20 +173,20 @@ def _motion(config: Config, data: dataset.Store):
         if config.onsets_only:
             halves = motions.halves(data, "train", names=names)
             return [halves.take(halves.start == 0)]
-        return transitions.everything(data, "train", names=names, per_pair=per_pair)
+        return transitions.all_pairs(data, "train", names=names, per_pair=per_pair)
 
     folder = config.out / "motion"
     fit = fit_motion.fit_flow if config.generator == "flow" else fit_motion.fit_gan
     with _timed(folder) as seconds:
         known = motions.join(*parts(transitions.CHARTED))
-        chart = transitions.chart_of(known, labels=len(names))
-        examples = transitions.examples_of(chart, parts(transitions.SPREAD))
+        chart = transitions.fit_chart(known, labels=len(names))
+        examples = transitions.encode_examples(chart, parts(transitions.SPREAD))
         generator = fit(examples, chart, folder, plan=_motion_plan(config), seed=config.seed)
     beginnings = transitions.fit_starts(chart, motions.halves(data, "train", names=names))
     return (generator, beginnings), seconds()
 
 
-def _decoder(config: Config, data: dataset.Store, hierarchy):
+def _decoder(config: Config, data: dataset.Dataset, hierarchy):
     """The way from landmarks to meshes, and the seconds it took."""
     if config.decoder is not None:
         return pipeline.load(config.decoder).decoder, 0.0

@@ -109,7 +109,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _data(config: Config) -> dataset.Store:
+def _data(config: Config) -> dataset.Dataset:
     if config.data is None:
         return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
     data = dataset.open_meshes(config.data)
@@ -118,7 +118,7 @@ def _data(config: Config) -> dataset.Store:
     return data
 
 
-def _draw(data: dataset.Store, split: str, config: Config) -> list[Face]:
+def _draw(data: dataset.Dataset, split: str, config: Config) -> list[Face]:
     """A fixed draw of a split's meshes, by subject."""
     meshes = of_split(data, split)
     rng = np.random.default_rng(config.seed)
@@ -188,7 +188,7 @@ def _best(rows: list[dict[str, Any]]) -> Form:
     return Form(*(best[name] for name in Form._fields))
 
 
-def _per_frame(data: dataset.Store, form: Form, face: np.ndarray) -> dict[str, float]:
+def _per_frame(data: dataset.Dataset, form: Form, face: np.ndarray) -> dict[str, float]:
     """Bare, one system per face and the paper's one per frame, on the drawn meshes of a sequence per test subject."""
     found: dict[str, list] = {"once": [], "per_frame": [], "between_them": []}
     for i, s in enumerate(data.subjects("test")):

@@ -119,13 +119,13 @@ def _trial(index: int, kind: str, size: int, marks: int, seed: int) -> tuple[dic
     seconds = time.perf_counter() - begun
     placed = (found.vertices - move) @ turn
     true = closest_point.surface(head.neutral, template.faces)
-    off = closest_point.query(true, placed).distance
+    off = closest_point.closest_points(true, placed).distance
     apart = np.linalg.norm(placed - head.neutral, axis=1)
-    hung = registration.carrier(placed, template.faces, vertices, faces)
-    hits = closest_point.query(true, vertices)
+    hung = registration.bind(placed, template.faces, vertices, faces)
+    hits = closest_point.closest_points(true, vertices)
     there = closest_point.at(true, hits, head.moved)
     shown = closest_point.at(true, hits, template.face_mask.astype(np.float64)) > 0.5
-    lost = np.linalg.norm(registration.carry(hung, head.moved) - there, axis=1)
+    lost = np.linalg.norm(registration.transfer_displacements(hung, head.moved) - there, axis=1)
     face = template.face_mask
     errors = {
         "surface_mm": off[face].mean(),

@@ -55,7 +55,7 @@ def run(config: Config) -> dict[str, Any]:
     known = _cases.is_makehuman(data)
     takes = [take for take in data.sequences if ">" not in take.label]
     found = (
-        [apex_detection.find(*_curve(data, take)) for take in takes]
+        [apex_detection.detect(*_curve(data, take)) for take in takes]
         if known
         else [apex_detection.Cuts(*take[4:8]) for take in takes]
     )
@@ -70,13 +70,13 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _curve(data: dataset.Store, take: dataset.Sequence) -> tuple[np.ndarray, np.ndarray]:
+def _curve(data: dataset.Dataset, take: dataset.Sequence) -> tuple[np.ndarray, np.ndarray]:
     """Landmarks (T, L, 3) of a recording, and those at rest (L, 3)."""
     curve = np.asarray(data.landmarks[take.start : take.start + take.frames])
     return curve, data.neutral[take.subject][data.landmark_index]
 
 
-def _csv(data: dataset.Store, takes, found) -> str:
+def _csv(data: dataset.Dataset, takes, found) -> str:
     """The cuts as `facejax data prepare --cuts` reads them."""
     rows = ["subject,recording," + ",".join(apex_detection.Cuts._fields)]
     for take, cut in zip(takes, found, strict=True):
@@ -119,7 +119,7 @@ def _table(metrics: dict[str, Any]) -> str:
     return f"{metrics['recordings']} recordings:\n\n{_run.markdown(header, body)}"
 
 
-def _plot(path: Path, data: dataset.Store, takes, found, known: bool, panels: int) -> Path:
+def _plot(path: Path, data: dataset.Dataset, takes, found, known: bool, panels: int) -> Path:
     chosen = np.unique(np.linspace(0, len(takes) - 1, min(panels, len(takes))).round().astype(int))
     lines = -(-len(chosen) // COLUMNS)
     figure, axes = plt.subplots(

@@ -102,7 +102,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _of_recording(config: Config, data: dataset.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_recording(config: Config, data: dataset.Dataset) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every passage and person, test subjects of makehuman4d, as their own rigs move them."""
     if not _cases.is_makehuman(data):
         raise ValueError(f"--recording moves people of makehuman4d, and {config.data} has others: use --speech")
@@ -122,7 +122,7 @@ def _of_recording(config: Config, data: dataset.Store) -> list[tuple[_transferre
     return [pair for of_one in moved.values() for pair in zip(first, of_one, strict=True)]
 
 
-def _of_dataset(config: Config, data: dataset.Store) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_dataset(config: Config, data: dataset.Dataset) -> list[tuple[_transferred.Take, _transferred.Take]]:
     """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
     talk = dataset.open_meshes(config.speech)
     _cases.check_alike(talk, data)

@@ -23,7 +23,7 @@ import numpy as np
 
 from experiments import _cases, _dense, _run
 from facejax.data import dataset
-from facejax.data.mesh_subset import Meshes, of_split
+from facejax.data.mesh_subset import MeshSubset, of_split
 from facejax.evaluation import vertex_error
 
 matplotlib.use("Agg")
@@ -93,17 +93,17 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _noise_alone(noisy: Meshes, clean: Meshes, regions: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
+def _noise_alone(noisy: MeshSubset, clean: MeshSubset, regions: dict[str, np.ndarray]) -> dict[str, dict[str, float]]:
     """How far the meshes are from the same ones without their noise."""
     pairs = ((true, made) for (_, made), (_, true) in zip(noisy, clean, strict=True))
     return vertex_error.vertex_errors(lambda moved: moved, pairs, regions)
 
 
-def _everybody(data: dataset.Store) -> Meshes:
+def _everybody(data: dataset.Dataset) -> MeshSubset:
     return of_split(data, *(split for split in dataset.SPLITS if len(data.subjects(split))))
 
 
-def _training(data: dataset.Store) -> Meshes:
+def _training(data: dataset.Dataset) -> MeshSubset:
     known = [split for split in ("train", "validation") if len(data.subjects(split))]
     return _cases.at_most(of_split(data, *known))
 

@@ -63,7 +63,7 @@ def run(config: Config) -> dict[str, Any]:
     for name, changes in VARIANTS.items():
         begun = time.perf_counter()
         options = _dense.options_of(case, mode, config.seed, hierarchy)
-        plan = options.decoder if mode != "default" else fit_s2d_dec.Plan(steps=config.steps)
+        plan = options.decoder if mode != "default" else fit_s2d_dec.S2DDecPlan(steps=config.steps)
         options = options._replace(decoder=plan._replace(**changes))
         folder = config.folder() / name.replace(", ", "-").lower()
         result = _dense.judge("s2d", case, folder, options, regions)[0.0]

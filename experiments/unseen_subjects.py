@@ -21,7 +21,7 @@ import numpy as np
 
 from experiments import _cases, _run
 from facejax.data import dataset
-from facejax.data.mesh_subset import Meshes, of_split
+from facejax.data.mesh_subset import MeshSubset, of_split
 from facejax.data.synthetic import makehuman4d, rig
 from facejax.evaluation import vertex_error
 from facejax.models.decoders import linear, s2d_dec
@@ -48,7 +48,7 @@ class Config:
     """Of the dataset."""
     meshes: int = 20_000
     """Of the dataset."""
-    steps: int = fit_s2d_dec.Plan().steps
+    steps: int = fit_s2d_dec.S2DDecPlan().steps
     """Of S2D-Dec."""
     publish: bool = False
     """Also write the figures that the README quotes."""
@@ -77,7 +77,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _data(config: Config, level: int | str) -> dataset.Store:
+def _data(config: Config, level: int | str) -> dataset.Dataset:
     if config.data is not None:
         return dataset.open_meshes(config.data)
     return makehuman4d.prepare(makehuman4d.Spec(level, config.subjects, config.meshes))
@@ -87,9 +87,9 @@ def _named(level: int | str) -> str:
     return level if isinstance(level, str) else f"level {level}"
 
 
-def _decoder(config: Config, level: int | str, train: Meshes):
+def _decoder(config: Config, level: int | str, train: MeshSubset):
     hierarchy = jax.device_put(_cases.hierarchy_of(train.data))
-    folder, plan = config.out / _named(level).replace(" ", ""), fit_s2d_dec.Plan(steps=config.steps)
+    folder, plan = config.out / _named(level).replace(" ", ""), fit_s2d_dec.S2DDecPlan(steps=config.steps)
     params = fit_s2d_dec.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
     seconds = sum(entry["seconds"] for entry in metric_logger.read(folder))
     about = {"steps": plan.steps, "train_seconds": round(seconds, 1)}

@@ -219,7 +219,7 @@ def _filmed(config: Config, models: pipeline.Models, item: Item, motion: Motion)
     rest = np.asarray(pipeline.neutral_landmarks(models, makehuman.subject(item.subject).vertices))
     size = (config.width, config.width * 5 // 4)
     pictures = render.frames(
-        motion.vertices, models.face.faces, size=size, camera=render.aim(motion.vertices, size=size, turn=TURN),
+        motion.vertices, models.face.faces, size=size, camera=render.fit_camera(motion.vertices, size=size, turn=TURN),
         extras=eyes_teeth.parts(eyes_teeth.template(), rest, motion.landmarks),
     )  # fmt: skip
     texts = [f"{a} → {b}".replace("_", " ") for a, b in itertools.pairwise(item.labels)]

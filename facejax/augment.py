@@ -9,7 +9,7 @@ two expressions ("prototypes") are kept.
 The paper walks at an even pace, so that its transitions start and stop at once. Here the walk may go at the pace
 at which the second expression was performed, which has an onset.
 
-`halves`, `transition` and `transitions` are array functions. `prototypes`, `select`, `spread` and `one_of_each`
+`halves`, `transition` and `transitions` are array functions. `prototypes`, `select`, `spread` and `sample_per_pair`
 choose data once, on the host, in NumPy: the number of rows they return depends on the labels.
 """
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from facejax.geometry import align, sphere, srvf
 
-PACES = ("even", "performed")
+TIME_WARPS = ("even", "performed")
 
 
 class Motions(NamedTuple):
@@ -112,11 +112,11 @@ def transition(
 
 
 def transitions(
-    motions: Motions, pairs: np.ndarray, *, frames: int = 30, pace: str = "even", chunk: int = 128
+    motions: Motions, pairs: np.ndarray, *, frames: int = 30, time_warp: str = "even", chunk: int = 128
 ) -> Iterator[jax.Array]:
     """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
 
-    `pace`: "even", or "performed", at which the fraction of the geodesic walked by a frame is the share of its path
+    `time_warp`: "even", or "performed", at which the fraction of the geodesic walked by a frame is the share of its path
     that the second motion has covered by then. Memory does not grow with P. The last chunk is padded inside, so that
     all share one compilation. Raises `ValueError` on an unknown pace or a malformed or out-of-range pair, before
     anything is computed.
@@ -127,11 +127,11 @@ def transitions(
         raise ValueError(f"pairs: expected integers (P, 2), got {pairs.dtype} {pairs.shape}")
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")
-    if pace not in PACES:
-        raise ValueError(f"pace: expected one of {PACES}, got {pace!r}")
+    if time_warp not in TIME_WARPS:
+        raise ValueError(f"pace: expected one of {TIME_WARPS}, got {time_warp!r}")
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < count):
         raise ValueError(f"pairs: expected indices in [0, {count}), got {pairs.min()} to {pairs.max()}")
-    return _stream(motions, pairs, frames, pace, min(chunk, max(len(pairs), 1)))
+    return _stream(motions, pairs, frames, time_warp, min(chunk, max(len(pairs), 1)))
 
 
 def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.ndarray:
@@ -201,7 +201,7 @@ def spread(labels: np.ndarray, *, classes: int, per_pair: int | None = None, see
     return np.concatenate(pairs)
 
 
-def one_of_each(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.ndarray:
+def sample_per_pair(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.ndarray:
     """A mask (K,) that picks one motion, drawn by seed, of each (start, end) that occurs: OT23's test set."""
     start, end = np.asarray(start), np.asarray(end)
     if start.shape != end.shape or start.ndim != 1:
@@ -243,7 +243,7 @@ def _chunk(motions: Motions, pairs: jax.Array, *, frames: int, pace: str) -> jax
     first, second = (jax.tree.map(lambda x, rows=rows: x[rows], motions) for rows in pairs.T)
     tau = None
     if pace == "performed":
-        share = srvf.covered(second.q)
+        share = srvf.arc_length_fraction(second.q)
         place = jnp.linspace(0, share.shape[-1] - 1, frames)
         tau = jax.vmap(lambda one: jnp.interp(place, jnp.arange(len(one)), one))(share)
     ends = first.q, first.log_length, second.q, second.log_length, first.start, second.start

@@ -32,7 +32,7 @@ def store_of_balls():
     for subject in range(len(splits)):
         stretch = np.eye(3) + 0.15 * rng.normal(size=(3, 3))
         neutral.append(vertices @ stretch.T + 3 * bump(int(rng.integers(162)), 30.0)[:, None] * rng.normal(size=3))
-        carrier = deformation_transfer.Carrier(vertices, neutral[-1], faces, np.full(len(vertices), 2.0))
+        carrier = deformation_transfer.DeformationTransfer(vertices, neutral[-1], faces, np.full(len(vertices), 2.0))
         for label, first, second in zip(labels, mixed, curved, strict=True):
             own = rng.uniform(0.5, 1.5) * strength
             moved.append(neutral[-1] + carrier(own * first + own**2 * second))
@@ -41,4 +41,4 @@ def store_of_balls():
     neutral, moved = np.asarray(neutral, np.float32), np.concatenate(moved).astype(np.float32)
     drawn = np.sort(rng.permutation(start)[: 2 * start // 3])
     index = {"spec": {"name": "balls"}, "labels": labels, "subjects": [{"split": split} for split in splits]}
-    return dataset.Store(None, index, tuple(sequences), faces, neutral, moved[:, marks], moved[drawn], drawn, marks)
+    return dataset.Dataset(None, index, tuple(sequences), faces, neutral, moved[:, marks], moved[drawn], drawn, marks)

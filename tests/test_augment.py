@@ -250,22 +250,22 @@ def test_tau_walks_the_geodesic_and_the_performed_pace_is_the_share_covered():
     back = augment.transition(*args, jnp.linspace(1, 0, 9), frames=9)
     np.testing.assert_allclose(back, even[::-1], atol=1e-6)
     pairs = np.array([[0, 1], [2, 3], [1, 0]])
-    (found,) = augment.transitions(motions, pairs, frames=7, pace="performed")
+    (found,) = augment.transitions(motions, pairs, frames=7, time_warp="performed")
     for (i, j), one in zip(pairs, found, strict=True):
         steps = np.linalg.norm(np.asarray(motions.q[j]).reshape(6, -1), axis=1) ** 2
         share = np.concatenate([[0], np.cumsum(steps) / steps.sum()])
         wanted = augment.transition(*arguments(motions, i, j), jnp.asarray(share), frames=7)
         np.testing.assert_allclose(one, wanted, atol=1e-5)
     with pytest.raises(ValueError, match="pace: expected one of"):
-        augment.transitions(motions, pairs, pace="slow")
+        augment.transitions(motions, pairs, time_warp="slow")
     with pytest.raises(ValueError, match=r"tau: expected \(..., 9\)"):
         augment.transition(*args, jnp.zeros(5), frames=9)
 
 
 def test_another_number_of_frames_takes_the_performed_pace_between_its_frames():
     motions = encoded(onsets(6, 2))
-    (found,) = augment.transitions(motions, np.array([[0, 1]]), frames=10, pace="performed")
-    share = np.interp(np.linspace(0, 6, 10), np.arange(7), srvf.covered(motions.q[1]))
+    (found,) = augment.transitions(motions, np.array([[0, 1]]), frames=10, time_warp="performed")
+    share = np.interp(np.linspace(0, 6, 10), np.arange(7), srvf.arc_length_fraction(motions.q[1]))
     wanted = augment.transition(*arguments(motions, 0, 1), jnp.asarray(share, jnp.float32), frames=10)
     np.testing.assert_allclose(found[0], wanted, atol=1e-5)
 
@@ -289,8 +289,8 @@ def test_spread_lets_everybody_serve_equally_often(sizes, per_pair):
 
 def test_one_of_each_is_held_out():
     start, end = np.array([0, 0, 1, 1, 1, 2]), np.array([1, 1, 0, 2, 0, 1])
-    mask = augment.one_of_each(start, end)
+    mask = augment.sample_per_pair(start, end)
     assert sorted(zip(start[mask].tolist(), end[mask].tolist(), strict=True)) == [(0, 1), (1, 0), (1, 2), (2, 1)]
-    assert len({augment.one_of_each(start, end, seed=seed).tobytes() for seed in range(20)}) > 1
+    assert len({augment.sample_per_pair(start, end, seed=seed).tobytes() for seed in range(20)}) > 1
     with pytest.raises(ValueError, match="start, end: expected two"):
-        augment.one_of_each(start, end[:3])
+        augment.sample_per_pair(start, end[:3])

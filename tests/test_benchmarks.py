@@ -457,10 +457,10 @@ def test_motion_peer_takes_the_same_steps(name, fit, monkeypatch):
 
     sizes = {field: getattr(TINY.gan, field) for field in ("labels", "steps", "landmarks")}
     known = _transitions.made_up(TINY.motions, **sizes)
-    chart = transitions.chart_of(known, labels=3, rank=8, pose=3)
+    chart = transitions.fit_chart(known, labels=3, rank=8, pose=3)
     kind = name.lower()
     plan, config = getattr(TINY, f"{kind}_plan"), getattr(TINY, kind)
-    run = motion.handed(fit, transitions.examples_of(chart, [known]), chart, plan=plan, config=config)
+    run = motion.handed(fit, transitions.encode_examples(chart, [known]), chart, plan=plan, config=config)
     program, _ = motion.compiled(run)
     peer = getattr(_motion_torch, name)
     _motion_torch.check(peer(run.state, run.held, plan), program, run.state, run.rows, run.held)

@@ -187,7 +187,7 @@ def test_walks_are_those_of_the_library_and_takes_those_of_the_dataset(own_cache
     halves = _interpolated.joined(data, ("train",))
     onsets = _interpolated.onsets_of(halves)
     for pace in ("even", "performed"):
-        (theirs,) = motions.interpolated(onsets, len(data.labels), per_pair=1, choice="spread", pace=pace)
+        (theirs,) = motions.interpolated(onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace)
         pairs = augment.spread(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
         mine = _interpolated.walk(*(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace)
         np.testing.assert_allclose(mine.curves, theirs.curves, atol=1e-6)

@@ -70,10 +70,10 @@ def own(tmp_path_factory):
 @pytest.fixture(scope="module")
 def model(own, tmp_path_factory):
     """Its motion, and the released way to meshes: the triangles are MakeHuman's."""
-    data, path = dataset.open_store(own), tmp_path_factory.mktemp("model") / "own.safetensors"
-    known = motions.join(*transitions.everything(data, "train", per_pair=8))
-    chart = transitions.chart_of(known, labels=len(LABELS), rank=transitions.rank_of(known))
-    examples = transitions.examples_of(chart, known)
+    data, path = dataset.open_dataset(own), tmp_path_factory.mktemp("model") / "own.safetensors"
+    known = motions.join(*transitions.all_pairs(data, "train", per_pair=8))
+    chart = transitions.fit_chart(known, labels=len(LABELS), rank=transitions.default_rank(known))
+    examples = transitions.encode_examples(chart, known)
     motion = fit_motion.fit_flow(examples, chart, path.with_suffix(""), plan=fit_motion.FlowPlan(steps=2, batch=8))
     starts = transitions.fit_starts(chart, motions.halves(data, "train"))
     pipeline.save(path, pipeline.load()._replace(labels=LABELS, motion=motion, starts=starts))
@@ -171,7 +171,7 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
 
 
 def test_a_take_is_carried_onto_itself_and_stretched(own):
-    data = dataset.open_store(own)
+    data = dataset.open_dataset(own)
     take = _transferred.stored(data, 14, "gape")
     np.testing.assert_allclose(_transferred.onto(take, take, data.landmark_index), take.landmarks, atol=2e-3)
     np.testing.assert_array_equal(

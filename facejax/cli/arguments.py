@@ -51,7 +51,7 @@ class Generate:
     shard: int | None = None
     """With --count: motions in a file, by default as many as make 64 MB."""
     distributed: bool = False
-    """With --count: share the work with the other processes of a job, see `facejax.runtime.join`."""
+    """With --count: share the work with the other processes of a job, see `facejax.runtime.join_distributed`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Fit:
     quick: bool = False
     """A few steps only, to see that everything is in order."""
     distributed: bool = False
-    """Share each batch with the other processes of a job, see `facejax.runtime.join`."""
+    """Share each batch with the other processes of a job, see `facejax.runtime.join_distributed`."""
 
 
 @dataclasses.dataclass(frozen=True)

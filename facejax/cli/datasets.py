@@ -30,8 +30,8 @@ def generate_corpus(
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Write a corpus of motions of one face or of so many MakeHuman people; its index, and what was assumed."""
     if distributed:
-        runtime.join()
-    runtime.start()
+        runtime.join_distributed()
+    runtime.configure()
     if not 0 <= people <= MOST_PEOPLE:
         raise ValueError(f"--people must lie in 0..{MOST_PEOPLE}, got {people}")
     models, notes = pipeline.load(model), ()
@@ -42,7 +42,7 @@ def generate_corpus(
     else:
         vertices, notes = generate.read_neutral(face, model)
         neutrals = {"average" if face is None else face.stem: vertices}
-    outputs.writable(out)
+    outputs.make_output_folder(out)
     with outputs.progress(out.name, None) as advance:
         found = corpus.generate(models, request, neutrals, out, progress=advance)
     return [found.path / "index.json"], tuple(f"{face}: {note}" for note in notes)
@@ -54,7 +54,7 @@ def sample_faces(out: Path, count: int) -> list[Path]:
         raise ValueError(f"--count must lie in 1..1000, got {count}")
     topology = assets.load().faces
     people = [makehuman.subject(100 + i) for i in range(count)]
-    outputs.writable(out)
+    outputs.make_output_folder(out)
     paths = [out / f"{person.name}.ply" for person in people]
     for path, person in zip(paths, people, strict=True):
         io.save(path, person.vertices, topology)
@@ -65,7 +65,7 @@ def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
     """Make a makehuman4d, or find it made; returns its folder."""
     noise.check(spec.noise)
     if folder is not None:
-        outputs.writable(folder)
+        outputs.make_output_folder(folder)
     with outputs.progress(spec.name, spec.subjects) as advance:
         return makehuman4d.prepare(spec, folder=folder, progress=lambda done, total: advance(done)).path
 
@@ -82,29 +82,29 @@ def fit(
     from facejax.training.recipes import fit_bundle, fit_motion, fit_residual
 
     if distributed:
-        runtime.join()
-    runtime.start()
-    found = dataset.open_store(data)
+        runtime.join_distributed()
+    runtime.configure()
+    found = dataset.open_dataset(data)
     fit_bundle.check(found)
     if out.suffix != ".safetensors":
         raise ValueError(f"--out {out}: expected a file that ends in .safetensors")
-    outputs.writable(out.parent)
+    outputs.make_output_folder(out.parent)
     plans = fit_bundle.Plans()
     if quick:
-        plans = fit_bundle.Plans(fit_motion.FlowPlan(steps=200), fit_residual.Plan(steps=50))
+        plans = fit_bundle.Plans(fit_motion.FlowPlan(steps=200), fit_residual.ResidualPlan(steps=50))
     count = jax.device_count()
     if jax.process_count() == 1:  # no more devices than share every batch evenly
         count = math.gcd(count, plans.motion.batch, plans.residual.batch)
-    mesh = sharding.line(jax.devices()[:count]) if count > 1 else None
+    mesh = sharding.data_mesh(jax.devices()[:count]) if count > 1 else None
     models = fit_bundle.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, mesh=mesh)
     errors = vertex_error.of_models(models, found)
-    if sharding.is_first():
+    if sharding.is_primary():
         pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))
-    sharding.meet("the models are written")
+    sharding.barrier("the models are written")
     return out, errors
 
 
-def prepare_recordings(layout: str, root: Path, out: Path, **options) -> dataset.Store:
+def prepare_recordings(layout: str, root: Path, out: Path, **options) -> dataset.Dataset:
     """Read a user's recordings into a dataset (`facejax.data.layouts.prepare`), with a progress bar."""
     from facejax.data.importers import registry
 

@@ -27,8 +27,8 @@ PICTURE = (200, 250)
 def run(out: Path, *, seed: int = 7) -> Path:
     """Three unseen faces through `LABELS`; returns the summary's path."""
     clock = _Clock()
-    runtime.start()
-    outputs.writable(out)
+    runtime.configure()
+    outputs.make_output_folder(out)
     people = [makehuman.subject(i) for i in SUBJECTS]
     clock.lap("MakeHuman's assets and three faces")
     models = pipeline.load()
@@ -59,7 +59,7 @@ def run(out: Path, *, seed: int = 7) -> Path:
 
 def _pictures(scene: Scene, chosen: np.ndarray) -> np.ndarray:
     parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
-    camera = render.aim(scene.vertices, size=PICTURE, turn=15)
+    camera = render.fit_camera(scene.vertices, size=PICTURE, turn=15)
     return render.frames(scene.vertices[chosen], scene.faces, size=PICTURE, camera=camera, extras=parts)
 
 
@@ -95,6 +95,6 @@ def _summary(out: Path, names: Sequence[str], clock: _Clock) -> Path:
         "",
     ]
     path = out / "summary.md"
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text("\n".join(lines))
     return path

@@ -25,7 +25,7 @@ def generate(
     labels: Sequence[str],
     out: Path,
     *,
-    worn: scans.Worn | None = None,
+    worn: scans.BoundScan | None = None,
     model: Path | None = None,
     seed: int = 7,
     samples: int = 1,
@@ -39,7 +39,7 @@ def generate(
     `frames` as in `pipeline.landmarks`, or "natural": as long as people take, generated with the first sample. What is
     `worn` on this neutral face, a scan, is what moves.
     """
-    runtime.start()
+    runtime.configure()
     models = pipeline.load(model)
     pipeline.label_indices(models, labels)
     if worn is not None and not np.array_equal(models.face.faces, assets.load().faces):
@@ -53,8 +53,8 @@ def generate(
     landmarks = pipeline.landmarks(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )
-    outputs.writable(out)
-    written, name = [], outputs.stem(labels) if worn is None else f"{worn.name}-{outputs.stem(labels)}"
+    outputs.make_output_folder(out)
+    written, name = [], outputs.file_stem(labels) if worn is None else f"{worn.name}-{outputs.file_stem(labels)}"
     with outputs.progress("writing", samples * len(formats) + 1) as advance:
         for i, marks in enumerate(np.asarray(landmarks)):
             vertices = np.asarray(pipeline.meshes(models, marks, neutral))
@@ -102,7 +102,7 @@ def view(path: Path, out: Path | None = None, *, fps: float | None = None) -> Pa
     vertices, triangles, extra = _animation(path)
     stored = extra.pop("fps", 30.0)
     outputs.check_rate(stored if fps is None else fps)
-    outputs.writable(page.parent)
+    outputs.make_output_folder(page.parent)
     io.save(page, vertices, triangles, fps=stored if fps is None else fps, title=path.stem, **extra)
     return page
 
@@ -134,7 +134,7 @@ def animate(
 
     `options` go to `animation.prepare` (pin, kernel, sigma, smoothing).
     """
-    runtime.start()
+    runtime.configure()
     outputs.check_formats(formats)
     rate = motion.fps if fps is None else fps
     outputs.check_rate(rate)
@@ -146,7 +146,7 @@ def animate(
     template = models.face.vertices[models.face.landmark_index]
     source = str(mesh or name) + (f" with {landmarks}" if landmarks else "")
     face = retarget.prepare(vertices, triangles, marks, template, name=source, **options)
-    moved = np.asarray(retarget.move(face, motion.curve, intensity=intensity, head=head))
+    moved = np.asarray(retarget.animate(face, motion.curve, intensity=intensity, head=head))
     marks = np.asarray(retarget.landmarks_of(face, motion.curve, intensity=intensity))
     extras, notes = (), motion.notes + face.notes
     if len(face.landmarks) != eyes_teeth.IBUG:
@@ -154,7 +154,7 @@ def animate(
     elif eyes_teeth.has_eye_holes(face.vertices, face.faces, face.landmarks):
         extras = eyes_teeth.parts(eyes_teeth.template(), face.landmarks, marks)
     shot = scene.make(moved, face.faces, captions=motion.captions, landmarks=marks, extras=extras)
-    return _write(out, f"{name}-{outputs.stem([motion.name])}", shot, rate, formats), notes
+    return _write(out, f"{name}-{outputs.file_stem([motion.name])}", shot, rate, formats), notes
 
 
 def play(
@@ -173,7 +173,7 @@ def play(
     outputs.check_rate(rate)
     retarget.check_intensity(intensity)
     shape = makehuman.template()
-    posed = motion_sources.posed(recording, person, intensity=intensity)
+    posed = motion_sources.animate_person(recording, person, intensity=intensity)
     skin = posed[:, : len(shape.vertices)]
     parts, marks = makehuman_portrait.parts(posed), skin[:, shape.landmarks]
     shot = scene.make(skin, shape.faces, captions=((0, name),), landmarks=marks, extras=parts)
@@ -198,14 +198,14 @@ def _mesh(head: pipeline.Face, mesh: Path | None, landmarks: Path | None, person
 
 
 def _write(out: Path, stem: str, shot: Scene, rate: float, formats: Sequence[str]) -> list[Path]:
-    outputs.writable(out)
+    outputs.make_output_folder(out)
     written = []
     with outputs.progress("writing", len(formats) + 1) as advance:
         for suffix in formats:
             written.append(outputs.save(out, stem, suffix, shot, rate))
             advance()
         path = out / f"{stem}-landmarks.npz"
-        with atomic.replacing(path) as temporary:
+        with atomic.replace_file(path) as temporary:
             np.savez(temporary, landmarks=shot.landmarks, fps=np.float64(rate))
         written.append(path)
         advance()

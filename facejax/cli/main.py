@@ -65,7 +65,7 @@ def _generate(command: Generate) -> None:
     else:
         from facejax.inference import scans
 
-        worn, notes = scans.wear(scans.read(command.face, command.landmarks))
+        worn, notes = scans.bind_scan(scans.read(command.face, command.landmarks))
         neutral = worn.neutral
     labels = (command.start, command.end, *command.then)
     done = generate.generate(
@@ -133,17 +133,17 @@ def _animate(command: Animate) -> None:
                     recording, person or makehuman.average(), name, command.out, intensity=command.intensity, **shown
                 )
             )
-        motion = motion_sources.by_recording(recording, name=name)
+        motion = motion_sources.from_recording(recording, name=name)
     elif command.expression is not None:
         if command.frames == motion_sources.NATURAL:
             raise ValueError("--frames natural is of transitions; an expression takes its own time without --frames")
-        motion = motion_sources.by_expression(
+        motion = motion_sources.from_expression(
             command.expression, frames=command.frames, whole=command.whole, weights=command.model
         )
     else:
         labels = (command.start, command.end, *command.then)
         frames = 30 if command.frames is None else command.frames
-        motion = motion_sources.by_labels(labels, seed=command.seed, frames=frames, weights=command.model)
+        motion = motion_sources.from_labels(labels, seed=command.seed, frames=frames, weights=command.model)
     options = {
         "head": command.head,
         "pin": command.pin,
@@ -169,7 +169,7 @@ def _register(command: Register) -> None:
     from facejax.inference import scans
 
     scan = scans.read(command.scan, command.landmarks)
-    outputs.writable(command.out)
+    outputs.make_output_folder(command.out)
     _said(scans.save(scan, scans.fit(scan), command.out))
 
 

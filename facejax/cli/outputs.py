@@ -42,13 +42,13 @@ def check_rate(fps: float) -> None:
         raise ValueError(f"--fps must lie above 0, up to 1000, got {fps}")
 
 
-def stem(labels: Sequence[str]) -> str:
+def file_stem(labels: Sequence[str]) -> str:
     """A file name for a motion through labels; a long chain is named by its ends."""
     whole = "_".join(labels)
     return whole if len(whole) <= 80 else f"{labels[0]}_{labels[-1]}_{len(labels) - 1}_transitions"
 
 
-def writable(folder: Path) -> None:
+def make_output_folder(folder: Path) -> None:
     """Make a folder, or say in one line why files cannot be put there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +90,7 @@ def save(out: Path, stem: str, suffix: str, scene: Scene, fps: float) -> Path:
 def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], frames, fps: float) -> Path:
     """An NPZ of the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
     starts = np.array([start for start, _ in pipeline.captions(labels, frames=frames)])
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         np.savez(
             temporary, landmarks=np.asarray(landmarks, np.float32), labels=np.array(labels),
             starts=starts, fps=np.float64(fps),

@@ -20,14 +20,14 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # glibc's malloc.h
 _JOB = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
-def start() -> None:
-    """`compile_cache`, `keep_memory` and `hush`."""
+def configure() -> None:
+    """`compile_cache`, `keep_memory` and `quiet_warnings`."""
     compile_cache()
     keep_memory()
-    hush()
+    quiet_warnings()
 
 
-def hush() -> None:
+def quiet_warnings() -> None:
     """Let libraries keep to themselves what comes as an exception anyway.
 
     Where a checkpoint cannot be written or read, Orbax's tasks log hundreds of lines before the one that tells.
@@ -60,17 +60,17 @@ def keep_memory() -> bool:
     return bool(mallopt(_MMAP_THRESHOLD, 1 << 30) and mallopt(_TRIM_THRESHOLD, KEPT))
 
 
-def every_core() -> None:
+def use_all_cores() -> None:
     """Make every core of the processor a device of JAX.
 
-    `steps.side_by_side` then shares its models among them, `parallel.data_parallel` its batch. Raises `RuntimeError`
+    `steps.vectorize_models` then shares its models among them, `parallel.data_parallel` its batch. Raises `RuntimeError`
     where JAX has been used before.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     jax.config.update("jax_num_cpu_devices", cores or 1)
 
 
-def join(*, patience: int = 20) -> None:
+def join_distributed(*, patience: int = 20) -> None:
     """Join the other processes of a job, before anything else with JAX: `jax.devices()` are then everybody's.
 
     By `jax.distributed.initialize`, with what JAX_COORDINATOR_ADDRESS (host:port of the first), JAX_NUM_PROCESSES and

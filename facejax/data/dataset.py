@@ -26,7 +26,7 @@ INDEX_BYTES = 3 * 2**23  # of an index: thirty times as many when it is read
 SPLITS = ("train", "validation", "test")
 
 
-class StoreError(atomic.FileError):
+class DatasetError(atomic.FileError):
     """A store is missing, incomplete or of another schema."""
 
 
@@ -45,7 +45,7 @@ class Sequence(NamedTuple):
     name: str = ""  # the recording's own
 
 
-class Store(NamedTuple):
+class Dataset(NamedTuple):
     """An open dataset; the arrays are memory maps."""
 
     path: Path
@@ -64,9 +64,9 @@ class Store(NamedTuple):
         return tuple(self.index["labels"])
 
     def subjects(self, split: str) -> np.ndarray:
-        """Indices of a split's subjects. Raises `StoreError` for an unknown split."""
+        """Indices of a split's subjects. Raises `DatasetError` for an unknown split."""
         if split not in SPLITS:
-            raise StoreError(f"unknown split {split!r}, expected one of {', '.join(SPLITS)}")
+            raise DatasetError(f"unknown split {split!r}, expected one of {', '.join(SPLITS)}")
         return np.array([i for i, s in enumerate(self.index["subjects"]) if s["split"] == split], np.int64)
 
     def people(self) -> dict[str, list[str]]:
@@ -88,37 +88,37 @@ class Store(NamedTuple):
         return at, owner[at]
 
 
-def open_store(path: Path) -> Store:
-    """Open a dataset for reading. Raises `StoreError`, naming the file."""
+def open_dataset(path: Path) -> Dataset:
+    """Open a dataset for reading. Raises `DatasetError`, naming the file."""
     path = Path(path)
     try:
         if (path / "index.json").stat().st_size > INDEX_BYTES:
             raise ValueError(f"more than {INDEX_BYTES} bytes")
         index = json.loads((path / "index.json").read_text())
     except (OSError, ValueError, RecursionError) as error:
-        raise StoreError(f"{path / 'index.json'} cannot be read ({error}): is this a prepared dataset?") from error
+        raise DatasetError(f"{path / 'index.json'} cannot be read ({error}): is this a prepared dataset?") from error
     if not isinstance(index, dict) or index.get("schema") != SCHEMA:
         found = index.get("schema") if isinstance(index, dict) else None
-        raise StoreError(f"{path}: schema {found}, expected {SCHEMA}: prepare the dataset anew")
+        raise DatasetError(f"{path}: schema {found}, expected {SCHEMA}: prepare the dataset anew")
     arrays = {}
     for name in ("faces", "neutral", "landmarks", "vertices", "drawn", "landmark_index"):
         try:
             arrays[name] = np.load(path / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as error:
-            raise StoreError(f"{path / name}.npy cannot be read ({error}): prepare the dataset anew") from error
+            raise DatasetError(f"{path / name}.npy cannot be read ({error}): prepare the dataset anew") from error
     try:
         for name, array in arrays.items():
             expected = index["shapes"][name]
             if list(array.shape) != expected:
-                raise StoreError(f"{path / name}.npy has shape {array.shape}, expected {tuple(expected)}")
+                raise DatasetError(f"{path / name}.npy has shape {array.shape}, expected {tuple(expected)}")
         sequences = tuple(Sequence(**s) for s in index["sequences"])
         if not {"labels", "rate", "spec", "subjects"} <= set(index):
             raise KeyError("labels, rate, spec or subjects")
     except (KeyError, TypeError) as error:
-        raise StoreError(f"{path / 'index.json'} lacks {error}: prepare the dataset anew") from error
+        raise DatasetError(f"{path / 'index.json'} lacks {error}: prepare the dataset anew") from error
     if wrong := _wrong(index, sequences, arrays):
-        raise StoreError(f"{path / 'index.json'}: {wrong}: prepare the dataset anew")
-    return Store(path, index, sequences, **arrays)
+        raise DatasetError(f"{path / 'index.json'}: {wrong}: prepare the dataset anew")
+    return Dataset(path, index, sequences, **arrays)
 
 
 def _wrong(index: dict[str, Any], sequences: tuple[Sequence, ...], arrays: dict[str, np.ndarray]) -> str | None:
@@ -152,11 +152,11 @@ def _wrong(index: dict[str, Any], sequences: tuple[Sequence, ...], arrays: dict[
     return None
 
 
-def open_meshes(path: Path) -> Store:
-    """The same for what needs meshes. Raises `StoreError` for a dataset that holds landmarks alone, as BU-4DFE does."""
-    found = open_store(path)
+def open_meshes(path: Path) -> Dataset:
+    """The same for what needs meshes. Raises `DatasetError` for a dataset that holds landmarks alone, as BU-4DFE does."""
+    found = open_dataset(path)
     if len(found.vertices) == 0:
-        raise StoreError(f"{path}: holds landmarks alone, expected meshes")
+        raise DatasetError(f"{path}: holds landmarks alone, expected meshes")
     return found
 
 

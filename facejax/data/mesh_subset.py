@@ -16,10 +16,10 @@ Batch = tuple[np.ndarray, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
-class Meshes:
+class MeshSubset:
     """Some of a dataset's meshes. Iterating gives (landmarks (n, L, 3), vertices (n, N, 3)), n <= size, in order."""
 
-    data: dataset.Store
+    data: dataset.Dataset
     at: np.ndarray  # (G,) positions in `data.vertices`
     owner: np.ndarray  # (G,) subject of each
     size: int = 256
@@ -38,15 +38,15 @@ class Meshes:
         """How many meshes there are."""
         return len(self.at)
 
-    def where(self, keep: np.ndarray) -> Meshes:
+    def where(self, keep: np.ndarray) -> MeshSubset:
         """Those under a mask (G,)."""
         return dataclasses.replace(self, at=self.at[keep], owner=self.owner[keep])
 
-    def rows(self, which: np.ndarray) -> Meshes:
+    def rows(self, which: np.ndarray) -> MeshSubset:
         """Those at positions (n,), rising, of this selection."""
         return dataclasses.replace(self, at=self.at[which], owner=self.owner[which])
 
-    def of_labels(self, labels: Sequence[str], *, without: bool = False) -> Meshes:
+    def of_labels(self, labels: Sequence[str], *, without: bool = False) -> MeshSubset:
         """Those of frames that show one of the labels, or none of them."""
         return self.where(np.isin(self.labels, list(labels)) != without)
 
@@ -72,7 +72,7 @@ class Meshes:
             raise ValueError(f"by: expected 'subjects' or 'labels', got {by!r}")
         return self.owner if by == "subjects" else self.labels
 
-    def folds(self, count: int, *, by: str = "subjects") -> list[tuple[Meshes, Meshes]]:
+    def folds(self, count: int, *, by: str = "subjects") -> list[tuple[MeshSubset, MeshSubset]]:
         """(fit, held out) for each of `count` groups of subjects, or of labels, in sorted order.
 
         Of fewer subjects (or labels) than `count`, one each. Raises `ValueError` where there is only one.
@@ -84,7 +84,7 @@ class Meshes:
         parts = np.array_split(names, min(count, len(names)))
         return [(self.where(~np.isin(of, part)), self.where(np.isin(of, part))) for part in parts]
 
-    def thin(self, step: int) -> Meshes:
+    def thin(self, step: int) -> MeshSubset:
         """Every `step`-th mesh."""
         return self.where(np.arange(self.count) % step == 0)
 
@@ -93,9 +93,9 @@ class Meshes:
         return np.asarray(self.data.neutral[subject]), *self.read(np.flatnonzero(self.owner == subject))
 
 
-def of_split(data: dataset.Store, *splits: str, size: int = 256) -> Meshes:
+def of_split(data: dataset.Dataset, *splits: str, size: int = 256) -> MeshSubset:
     """The meshes of the subjects of one or more splits, in the order in which they are stored."""
     found = [data.meshes(split) for split in splits]
     at, owner = (np.concatenate(part) for part in zip(*found, strict=True))
     order = np.argsort(at, kind="stable")
-    return Meshes(data, at[order], owner[order], size)
+    return MeshSubset(data, at[order], owner[order], size)

@@ -39,7 +39,7 @@ class Motions(NamedTuple):
 
 
 def halves(
-    data: dataset.Store, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
+    data: dataset.Dataset, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
 ) -> Motions:
     """Every neutral -> peak and peak -> neutral motion of a split's subjects.
 
@@ -60,7 +60,7 @@ def halves(
     return _stack(rows)
 
 
-def directs(data: dataset.Store, split: str, *, frames: int = FRAMES) -> Motions:
+def directs(data: dataset.Dataset, split: str, *, frames: int = FRAMES) -> Motions:
     """The directly performed peak -> peak transitions of a split; no capture set has them, evaluation only."""
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=True):
@@ -76,7 +76,7 @@ def interpolated(
     per_pair: int | None,
     reuse: int | None = None,
     choice: str = "prototypes",
-    pace: str = "performed",
+    time_warp: str = "performed",
     only: Collection[tuple[int, int]] | None = None,
     seed: int = 0,
     frames: int = FRAMES,
@@ -86,7 +86,7 @@ def interpolated(
 
     `per_pair` of each ordered pair of expressions; None: all. `choice`: "prototypes", the nearest to the mean peaks of
     the two expressions (OT23; with `reuse`, no onset serves as the start, or as the end, of more than so many
-    transitions of one pair), or "spread", all people equally often. `pace` as in `augment.transitions`; `only`: the
+    transitions of one pair), or "spread", all people equally often. `time_warp` as in `augment.transitions`; `only`: the
     (start, end) that are wanted.
     """
     if choice not in ("prototypes", "spread"):
@@ -105,13 +105,13 @@ def interpolated(
         wanted = np.zeros((labels, labels), bool)
         wanted[tuple(np.array(sorted(only), int).reshape(-1, 2).T)] = True
         chosen = chosen[wanted[onsets.end[chosen[:, 0]], onsets.end[chosen[:, 1]]]]
-    return _between(onsets, motions, chosen, frames, pace, chunk)
+    return _between(onsets, motions, chosen, frames, time_warp, chunk)
 
 
 def _between(onsets: Motions, motions: augment.Motions, chosen, frames: int, pace: str, chunk: int):
     for low in range(0, len(chosen), chunk):
         pairs = chosen[low : low + chunk]
-        curves = [np.asarray(c) for c in augment.transitions(motions, pairs, frames=frames, pace=pace)]
+        curves = [np.asarray(c) for c in augment.transitions(motions, pairs, frames=frames, time_warp=pace)]
         first, second = pairs.T
         own = (onsets.end[first], onsets.end[second], onsets.subject[first], onsets.scale[first])
         yield Motions(np.concatenate(curves), *own, onsets.seconds[second])
@@ -123,7 +123,7 @@ def join(*parts: Motions) -> Motions:
 
 
 def recordings(
-    data: dataset.Store, split: str, *, direct: bool
+    data: dataset.Dataset, split: str, *, direct: bool
 ) -> Iterator[tuple[dataset.Sequence, np.ndarray, float]]:
     """Each sequence of a split, its displacements from neutral (T, L, 3), unitless, and the millimetres per unit."""
     members = set(data.subjects(split).tolist())

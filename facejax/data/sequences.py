@@ -43,7 +43,7 @@ class Block(NamedTuple):
     neutral: np.ndarray  # (K, L, 3)
 
 
-def read(data: dataset.Store, split: str, labels: Sequence[str]) -> Sequences:
+def read(data: dataset.Dataset, split: str, labels: Sequence[str]) -> Sequences:
     """The recordings of a split's subjects under some labels, in the dataset's order.
 
     Raises `ValueError` for a label of which the split has no recording.
@@ -78,7 +78,7 @@ def join(*parts: Sequences) -> Sequences:
     return Sequences(*(np.concatenate(fields) for fields in zip(*(extend(p, longest) for p in parts), strict=True)))
 
 
-def mirrored(sequences: Sequences) -> Sequences:
+def mirror(sequences: Sequences) -> Sequences:
     """The same people as in a mirror: what is left becomes right. Faces look along z, landmarks follow a known scheme.
 
     Raises `ValueError` for a number of landmarks that is no scheme's (`facejax.schemes`).

@@ -29,31 +29,33 @@ class Examples(NamedTuple):
 
 
 def transitions(
-    data: dataset.Store,
+    data: dataset.Dataset,
     split: str,
     *,
     names: Sequence[str] | None = None,
     per_pair: int = PER_PAIR,
     reuse: int | None = 1,
-    pace: str = "performed",
+    time_warp: str = "performed",
 ) -> motions.Motions:
     """OT23's set: halves, and the peak -> peak transitions nearest to the prototypes, between every two expressions.
 
-    `names` as in `data.motions.halves`; `per_pair`, `reuse` and `pace` as in `data.motions.interpolated`.
+    `names` as in `data.motions.halves`; `per_pair`, `reuse` and `time_warp` as in `data.motions.interpolated`.
     """
     halves = motions.halves(data, split, names=names)
     onsets = halves.take(halves.start == 0)
     count = len(data.labels if names is None else names)
-    return motions.join(halves, *motions.interpolated(onsets, count, per_pair=per_pair, reuse=reuse, pace=pace))
+    return motions.join(
+        halves, *motions.interpolated(onsets, count, per_pair=per_pair, reuse=reuse, time_warp=time_warp)
+    )
 
 
-def everything(
-    data: dataset.Store,
+def all_pairs(
+    data: dataset.Dataset,
     split: str,
     *,
     names: Sequence[str] | None = None,
     per_pair: int | None = SPREAD,
-    pace: str = "performed",
+    time_warp: str = "performed",
     seed: int = 0,
 ) -> Iterator[motions.Motions]:
     """Halves, and unselected peak -> peak transitions in which everybody meets everybody, part by part."""
@@ -61,12 +63,12 @@ def everything(
     yield halves
     onsets = halves.take(halves.start == 0)
     count = len(data.labels if names is None else names)
-    yield from motions.interpolated(onsets, count, per_pair=per_pair, choice="spread", pace=pace, seed=seed)
+    yield from motions.interpolated(onsets, count, per_pair=per_pair, choice="spread", time_warp=time_warp, seed=seed)
 
 
-def chart_of(
+def fit_chart(
     known: motions.Motions, *, labels: int, rank: int = 128, pose: int = 32, mean: str = "karcher"
-) -> tangent_pca.Chart:
+) -> tangent_pca.TangentPCA:
     """The chart of a training set, at the "karcher" mean of its motions, or their normalised "extrinsic" one.
 
     Its R = `rank` directions need more motions than that. Raises `ValueError` for labels beyond labels-1.
@@ -84,7 +86,7 @@ def chart_of(
     )  # fmt: skip
 
 
-def examples_of(chart: tangent_pca.Chart, parts: motions.Motions | Iterable[motions.Motions]) -> Examples:
+def encode_examples(chart: tangent_pca.TangentPCA, parts: motions.Motions | Iterable[motions.Motions]) -> Examples:
     """Motions in a chart's coordinates; parts are forgotten one after the other."""
     rows = []
     for part in [parts] if isinstance(parts, motions.Motions) else parts:
@@ -101,14 +103,16 @@ def balanced(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.resize(random.permutation(np.flatnonzero(pair == one)), most) for one in np.unique(pair)])
 
 
-def fit_starts(chart: tangent_pca.Chart, known: motions.Motions) -> start_poses.Params:
+def fit_starts(chart: tangent_pca.TangentPCA, known: motions.Motions) -> start_poses.StartPoses:
     """The peaks from which motions start when only a label is known, of the motions that start at one."""
     peaks = known.take((known.start == 0) & (known.end > 0))
-    poses = jax.vmap(tangent_pca.pose, (None, 0, 0))(chart, jnp.asarray(peaks.curves[:, -1]), jnp.asarray(peaks.end))
+    poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(
+        chart, jnp.asarray(peaks.curves[:, -1]), jnp.asarray(peaks.end)
+    )
     return start_poses.fit(np.asarray(poses), peaks.end, classes=len(chart.mean))
 
 
-def rank_of(known: motions.Motions) -> int:
+def default_rank(known: motions.Motions) -> int:
     """How many directions of motion to learn: a quarter as many as there are motions, where these are few.
 
     In directions that few of them take, the flow strays.
@@ -119,7 +123,7 @@ def rank_of(known: motions.Motions) -> int:
 @jax.jit
 def _place(chart, curves, log_seconds, start, end):
     q, log_length = srvf.encode(curves)
-    values = jax.vmap(tangent_pca.coordinates, (None, 0, 0, 0, 0, 0))(
+    values = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, 0, 0))(
         chart, sphere.log(chart.p, q), log_length, log_seconds, start, end
     )
-    return values, jax.vmap(tangent_pca.pose, (None, 0, 0))(chart, curves[:, 0], start)
+    return values, jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(chart, curves[:, 0], start)

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.geometry import rbf
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.mesh import rbf_weights
@@ -41,25 +41,25 @@ class Options(NamedTuple):
 
     by: str = "subjects"  # what will be new at test time, "subjects" or "labels": cross-validation holds it out
     seed: int = 0
-    decoder: fit_s2d_dec.Plan = fit_s2d_dec.Plan()
-    residual: fit_residual.Plan = fit_residual.Plan()
-    neural3dmm: fit_neural3dmm.Plan = fit_neural3dmm.Plan()
+    decoder: fit_s2d_dec.S2DDecPlan = fit_s2d_dec.S2DDecPlan()
+    residual: fit_residual.ResidualPlan = fit_residual.ResidualPlan()
+    neural3dmm: fit_neural3dmm.Neural3DMMPlan = fit_neural3dmm.Neural3DMMPlan()
     components: int = gpmm.COMPONENTS
-    base: fit_gpmm.Fitted | None = None  # of the residual decoder, where it is known already
+    base: fit_gpmm.FittedGPMM | None = None  # of the residual decoder, where it is known already
     hierarchy: mesh_hierarchy.Hierarchy | None = None  # of the spiral networks; by default made of the mean face
 
 
 class Method(NamedTuple):
     """A way from landmarks to a mesh."""
 
-    fit: Callable[[Meshes, Path, Options], Any]
+    fit: Callable[[MeshSubset, Path, Options], Any]
     apply: Callable[[Any, np.ndarray, np.ndarray], np.ndarray]  # displacements (T, L, 3), neutral (N, 3) -> (T, N, 3)
 
 
 class LinearFit(NamedTuple):
     """A linear map, and the weight of its prior that cross-validation chose."""
 
-    params: linear.Params
+    params: linear.LinearMap
     alpha: float  # mm^2
 
 
@@ -70,7 +70,7 @@ class Rest(NamedTuple):
     landmark_index: np.ndarray
 
 
-def _hierarchy(train: Meshes, options: Options) -> mesh_hierarchy.Hierarchy:
+def _hierarchy(train: MeshSubset, options: Options) -> mesh_hierarchy.Hierarchy:
     if options.hierarchy is not None:
         return options.hierarchy
     template = np.asarray(train.data.neutral[train.subjects], np.float64).mean(axis=0)
@@ -78,7 +78,7 @@ def _hierarchy(train: Meshes, options: Options) -> mesh_hierarchy.Hierarchy:
 
 
 def _linear(model: linear.Model, **fixed) -> Method:
-    def fit(train: Meshes, folder: Path, options: Options) -> LinearFit:
+    def fit(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
         return LinearFit(*fit_linear.fit_linear(model, train, by=options.by, **fixed))
 
     return Method(fit, _apply_linear)
@@ -88,7 +88,7 @@ def _apply_linear(fitted: LinearFit, displacements: np.ndarray, neutral: np.ndar
     return neutral + np.asarray(linear.apply(fitted.params, displacements))
 
 
-def _fit_dictionary(train: Meshes, folder: Path, options: Options) -> LinearFit:
+def _fit_dictionary(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
     index = np.asarray(train.data.landmark_index)
     found = fit_linear.fit_linear(
         dictionary.model, train, by=options.by, landmark_index=index, atoms=dictionary.ATOMS, seed=options.seed
@@ -99,7 +99,7 @@ def _fit_dictionary(train: Meshes, folder: Path, options: Options) -> LinearFit:
 class _Whole(NamedTuple):
     """Meshes with their people's faces still in them, as displacements from the mean of all faces."""
 
-    meshes: Meshes
+    meshes: MeshSubset
 
     def __iter__(self):
         rest, at = self.meshes.data.neutral, self.meshes.data.landmark_index
@@ -110,7 +110,7 @@ class _Whole(NamedTuple):
             yield off[:, at], off
 
 
-def _fit_whole(train: Meshes, folder: Path, options: Options) -> LinearFit:
+def _fit_whole(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
     def prepare(batches, **_):
         return linear.pca.prepare(_Whole(batches), components=220)
 
@@ -124,7 +124,7 @@ def _fit_whole(train: Meshes, folder: Path, options: Options) -> LinearFit:
     return LinearFit(*fit_linear.fit_linear(linear.model(prepare, solve), train, by=options.by))
 
 
-def _fit_s2d(train: Meshes, folder: Path, options: Options):
+def _fit_s2d(train: MeshSubset, folder: Path, options: Options):
     hierarchy = jax.device_put(_hierarchy(train, options))
     return fit_s2d_dec.fit(train, hierarchy, folder, plan=options.decoder, seed=options.seed), hierarchy
 
@@ -134,39 +134,43 @@ def _apply_s2d(fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.nda
     return neutral + np.asarray(s2d_dec.apply(params, hierarchy, np.asarray(displacements, np.float32)))
 
 
-def _fit_gpmm(train: Meshes, folder: Path, options: Options) -> fit_gpmm.Fitted:
+def _fit_gpmm(train: MeshSubset, folder: Path, options: Options) -> fit_gpmm.FittedGPMM:
     return options.base or fit_gpmm.fit(train, by=options.by, components=options.components)
 
 
-def _apply_gpmm(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    return neutral + np.asarray(linear.apply(gpmm.on_face(fitted.params, neutral), displacements))
+def _apply_gpmm(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    return neutral + np.asarray(linear.apply(gpmm.linear_map(fitted.params, neutral), displacements))
 
 
-def _apply_doubting(fitted: fit_gpmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    params = gpmm.told(fitted.params, gpmm.noise_of(fitted.params, neutral, displacements))
-    return neutral + np.asarray(linear.apply(gpmm.on_face(params, neutral), displacements))
+def _apply_doubting(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    params = gpmm.with_landmark_noise(
+        fitted.params, gpmm.estimate_landmark_noise(fitted.params, neutral, displacements)
+    )
+    return neutral + np.asarray(linear.apply(gpmm.linear_map(params, neutral), displacements))
 
 
-def _fit_residual(train: Meshes, folder: Path, options: Options) -> gpmm_residual.Params:
+def _fit_residual(train: MeshSubset, folder: Path, options: Options) -> gpmm_residual.GPMMResidual:
     return fit_residual.fit(
         train, _hierarchy(train, options), folder, plan=options.residual, by=options.by, seed=options.seed,
         base=_fit_gpmm(train, folder, options),
     )  # fmt: skip
 
 
-def _apply_residual(fitted: gpmm_residual.Params, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_residual(fitted: gpmm_residual.GPMMResidual, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     return neutral + np.asarray(gpmm_residual.apply(fitted, displacements, neutral))
 
 
-def _fit_neural(train: Meshes, folder: Path, options: Options) -> fit_neural3dmm.Fitted:
+def _fit_neural(train: MeshSubset, folder: Path, options: Options) -> fit_neural3dmm.FittedNeural3DMM:
     return fit_neural3dmm.fit(train, _hierarchy(train, options), folder, plan=options.neural3dmm, seed=options.seed)
 
 
-def _apply_neural(fitted: fit_neural3dmm.Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_neural(
+    fitted: fit_neural3dmm.FittedNeural3DMM, displacements: np.ndarray, neutral: np.ndarray
+) -> np.ndarray:
     return neutral + fit_neural3dmm.apply(fitted, displacements, neutral)
 
 
-def _rest(train: Meshes, folder: Path, options: Options) -> Rest:
+def _rest(train: MeshSubset, folder: Path, options: Options) -> Rest:
     return Rest(np.asarray(train.data.faces), np.asarray(train.data.landmark_index))
 
 

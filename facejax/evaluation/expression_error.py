@@ -25,7 +25,7 @@ def mean_sequence(train: sequences.Sequences, frames: int) -> MeanSequence:
 
 
 def expression_scores(
-    params: expression_lstm.Params,
+    params: expression_lstm.ExpressionLSTM,
     held_out: sequences.Sequences,
     train: sequences.Sequences,
     *,

@@ -19,7 +19,7 @@ NEIGHBOURS = 10
 MEAN_OVER_RMS = np.sqrt(8 / (3 * np.pi))
 
 
-def pairs(
+def nearest_pairs(
     landmarks: np.ndarray, group: np.ndarray, *, apart: np.ndarray | None = None, alike: bool = False,
     count: int = NEIGHBOURS,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
@@ -45,7 +45,7 @@ def pairs(
 
 
 def estimate(left: np.ndarray, both: np.ndarray, squared: np.ndarray) -> np.ndarray:
-    """The floor (N,) in mm, mean distance per vertex, of what a map left over (F, N, 3), from `pairs`."""
+    """The floor (N,) in mm, mean distance per vertex, of what a map left over (F, N, 3), from `nearest_pairs`."""
     gaps = np.zeros((len(both), left.shape[1]), np.float32)
     for low in range(0, len(both), 256):
         some = both[low : low + 256]

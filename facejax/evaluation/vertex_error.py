@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from facejax.data import dataset, mesh_subset
-from facejax.data.mesh_subset import Batch, Meshes
+from facejax.data.mesh_subset import Batch, MeshSubset
 from facejax.inference import pipeline
 
 EDGES = np.geomspace(1e-5, 20.0, 253)  # mm, of cumulative curves: forty a decade
@@ -38,7 +38,7 @@ class Distances(NamedTuple):
 
 
 def distances(
-    apply: Callable[[np.ndarray, np.ndarray], np.ndarray], test: Meshes, regions: dict[str, np.ndarray], *,
+    apply: Callable[[np.ndarray, np.ndarray], np.ndarray], test: MeshSubset, regions: dict[str, np.ndarray], *,
     noise: float = 0.0, seed: int = 0,
 ) -> Distances:  # fmt: skip
     """Judge `apply(landmark displacements (T, L, 3), neutral (N, 3)) -> vertices (T, N, 3)` person by person.
@@ -85,7 +85,7 @@ def _summed(pairs: Iterable[Batch], regions: dict[str, np.ndarray]) -> Distances
     return found
 
 
-def of_models(models: pipeline.Models, data: dataset.Store, *splits: str) -> dict[str, float]:
+def of_models(models: pipeline.Models, data: dataset.Dataset, *splits: str) -> dict[str, float]:
     """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
     held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
     if not held:

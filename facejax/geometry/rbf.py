@@ -49,7 +49,7 @@ class Kernel(NamedTuple):
     definite: bool
 
 
-class Fit(NamedTuple):
+class Rbf(NamedTuple):
     """A solved rest pose."""
 
     kernel: str
@@ -66,7 +66,7 @@ def fit(
     sigma: float | None = None,
     smoothing: float = 0.0,
     affine: bool = True,
-) -> Fit:
+) -> Rbf:
     """Solve the system of landmarks at rest (L, 3), once for all motions of a face.
 
     kernel: a name in `KERNELS`. sigma: its width in landmark spacings, by default the kernel's usual one; thin_plate
@@ -102,10 +102,10 @@ def fit(
             f"sigma: {kernel} of width {sigma:g} is too wide for these landmarks, and misses them by {missed:.0e} of "
             "their displacement; make sigma smaller, or add smoothing"
         )
-    return Fit(kernel, centres, origin, unit, np.ascontiguousarray(inverse))
+    return Rbf(kernel, centres, origin, unit, np.ascontiguousarray(inverse))
 
 
-def weights(fit: Fit, vertices: np.ndarray) -> np.ndarray:
+def weights(fit: Rbf, vertices: np.ndarray) -> np.ndarray:
     """How far each landmark moves each vertex at rest (N, 3): (N, L) float32, at a landmark a row with a single 1.
 
     In float64 on the host, once per face. Raises `ValueError` for vertices that are not finite, or traced.
@@ -132,7 +132,7 @@ def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
     return jnp.stack(axes, axis=-1)
 
 
-def apply(fit: Fit, displacements: jax.Array, vertices: np.ndarray) -> jax.Array:
+def apply(fit: Rbf, displacements: jax.Array, vertices: np.ndarray) -> jax.Array:
     """Displacements (..., N, 3) of vertices at rest (N, 3), where the landmarks move by (..., L, 3).
 
     `displacements` may be traced by jit, vmap or grad. `vertices` may not: under jit compute `weights` outside.
@@ -165,7 +165,7 @@ def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **o
     return out
 
 
-def _spread(fit: Fit, vertices: np.ndarray, dtype: type) -> jax.Array:
+def _spread(fit: Rbf, vertices: np.ndarray, dtype: type) -> jax.Array:
     """How far each landmark moves each vertex (N, 3): (N, L) of a dtype on the host, computed in float64."""
     host = jax.devices("cpu")[0]
     # Also within a trace: everything here is known.

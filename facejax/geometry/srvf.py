@@ -81,7 +81,7 @@ def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def covered(q: jax.Array) -> jax.Array:
+def arc_length_fraction(q: jax.Array) -> jax.Array:
     """The share (..., T) of its path that the motion q (..., T-1, L, 3) has covered by each frame, from 0 to 1.
 
     Speed is |q|^2, so this is the time-warp that makes the motion from one of even speed. A motion at standstill has

@@ -31,8 +31,8 @@ class Drawn(NamedTuple):
 
 
 def compose(
-    generator: generators.Params,
-    beginnings: start_poses.Params,
+    generator: generators.Generator,
+    beginnings: start_poses.StartPoses,
     key: jax.Array,
     labels: Sequence[int],
     *,
@@ -46,8 +46,8 @@ def compose(
     labels, one that the generator does not know, one that follows itself, no samples, or frames that do not fit.
     """
     generators.kind(generator)
-    pairs = pairs_of(labels, classes=len(generator.chart.mean))
-    drawn = draw(generator, beginnings, keys_of(key, samples), pairs)
+    pairs = label_pairs(labels, classes=len(generator.chart.mean))
+    drawn = draw(generator, beginnings, sample_keys(key, samples), pairs)
     count, length = drawn.curves.shape[1:3]
     each = [length if frames is None else frames] * count if np.ndim(frames) == 0 else frames
     if len(each) != count:
@@ -55,7 +55,7 @@ def compose(
     return join(drawn.curves, jnp.asarray(timeline(each, drawn=length)))
 
 
-def pairs_of(labels: Sequence[int], *, classes: int | None = None) -> jax.Array:
+def label_pairs(labels: Sequence[int], *, classes: int | None = None) -> jax.Array:
     """The transitions (P, 2) through label numbers.
 
     Raises `ValueError` for names, a number outside 0..classes-1, or a label that follows itself.
@@ -74,7 +74,7 @@ def pairs_of(labels: Sequence[int], *, classes: int | None = None) -> jax.Array:
     return jnp.asarray(np.stack([labels[:-1], labels[1:]], axis=1), jnp.int32)
 
 
-def keys_of(key: jax.Array, samples: int) -> jax.Array:
+def sample_keys(key: jax.Array, samples: int) -> jax.Array:
     """One key for each sample (S,), of which the first ones do not depend on S."""
     if samples < 1:
         raise ValueError(f"samples must be 1 or more, got {samples}")
@@ -82,7 +82,9 @@ def keys_of(key: jax.Array, samples: int) -> jax.Array:
 
 
 @jax.jit
-def draw(generator: generators.Params, beginnings: start_poses.Params, keys: jax.Array, pairs: jax.Array) -> Drawn:
+def draw(
+    generator: generators.Generator, beginnings: start_poses.StartPoses, keys: jax.Array, pairs: jax.Array
+) -> Drawn:
     """Draw transitions between labels `pairs` (P, 2), each from the end of the one before; one sample per key (S,).
 
     The first starts at a peak of its label, drawn from `beginnings`.
@@ -91,7 +93,7 @@ def draw(generator: generators.Params, beginnings: start_poses.Params, keys: jax
 
     def one(key):
         first_key, key = jax.random.split(key)
-        first = tangent_pca.unpose(chart, _beginning(generator, beginnings, first_key, pairs[0, 0]), pairs[0, 0])
+        first = tangent_pca.decode_pose(chart, _beginning(generator, beginnings, first_key, pairs[0, 0]), pairs[0, 0])
 
         def transition(here, inputs):
             key, (start, end) = inputs
@@ -145,20 +147,20 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
 
 
 def _beginning(generator, beginnings, key, label):
-    if generators.heeds_pose(generator):
+    if generators.uses_start_pose(generator):
         return start_poses.sample(beginnings, key, label)
     # A motion drawn for nobody in particular starts at the mean peak, as in the paper.
     return jnp.zeros_like(generator.chart.pose_scale)
 
 
 def _transition(generator, beginnings, chart, key, here, start, end):
-    pose = start_poses.plausible(beginnings, tangent_pca.pose(chart, here, start), start)
+    pose = start_poses.clip_to_distribution(beginnings, tangent_pca.encode_pose(chart, here, start), start)
     motion = generators.sample(generator, key, start, end, pose)
-    if not generators.heeds_pose(generator):
+    if not generators.uses_start_pose(generator):
         return srvf.decode(motion.q, motion.log_length, here), motion.log_seconds
-    meant = tangent_pca.unpose(chart, pose, start)
+    meant = tangent_pca.decode_pose(chart, pose, start)
     curve = srvf.decode(motion.q, motion.log_length, meant)
-    covered = srvf.covered(motion.q)[:, None, None]
+    covered = srvf.arc_length_fraction(motion.q)[:, None, None]
     # No jump, and no motion where there was none: what separates the two beginnings fades along the path. A way home
     # ends at neutral exactly, which no network can promise.
     curve = curve + (1 - covered) * (here - meant)

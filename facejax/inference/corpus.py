@@ -61,9 +61,9 @@ def generate(
     mine = range(jax.process_index(), len(plan.firsts), jax.process_count())
     wanting = [number for number in mine if not _is_done(out, number)]
     _room(out, plan, len(wanting))
-    if sharding.is_first():
-        metric_logger.claim(out, plan.claim)
-    sharding.meet("claimed")
+    if sharding.is_primary():
+        metric_logger.claim_folder(out, plan.claim)
+    sharding.barrier("claimed")
     for name in ("shards", "done"):
         (out / name).mkdir(exist_ok=True)
     progress(len(mine) - len(wanting), len(mine))
@@ -71,10 +71,10 @@ def generate(
     for i, number in enumerate(wanting):
         _write(out, number, make(plan.firsts[number], plan.counts[number]))
         progress(len(mine) - len(wanting) + i + 1, len(mine))
-    sharding.meet("made")
-    if sharding.is_first():
+    sharding.barrier("made")
+    if sharding.is_primary():
         _finish(out, plan)
-    sharding.meet("finished")
+    sharding.barrier("finished")
     return corpora.load(out)
 
 
@@ -98,7 +98,7 @@ def _plan(models: pipeline.Models, request: Request, neutrals: dict[str, np.ndar
         pipeline.neutral_landmarks(models, neutral)
     if request.labels:
         numbers = pipeline.label_indices(models, request.labels)
-        pairs = np.asarray(composition.pairs_of(numbers, classes=len(models.labels)))[None]
+        pairs = np.asarray(composition.label_pairs(numbers, classes=len(models.labels)))[None]
     else:
         known = range(len(models.labels))
         pairs = np.array([[(a, b)] for a in known for b in known if a != b], np.int32)
@@ -134,22 +134,22 @@ def maker(
     """`make(first, count)`: the arrays of so many sequences. Arguments and errors as of `generate`."""
     plan, mesh, faces = (
         _plan(models, request, neutrals),
-        sharding.line(devices or jax.local_devices()),
+        sharding.data_mesh(devices or jax.local_devices()),
         list(neutrals.values()),
     )
     count = -(-AT_ONCE // mesh.size) * mesh.size  # whatever is wanted, so that one program does it, with the same bits
     line = composition.timeline([request.frames] * plan.pairs.shape[1])
     at = models.face.landmark_index
     rest = np.stack([np.asarray(neutral, np.float32)[at] for neutral in faces])
-    held = sharding.put(
-        (models.motion, models.starts, jax.random.key(request.seed), plan.pairs, line, rest), sharding.everywhere(mesh)
+    held = sharding.shard(
+        (models.motion, models.starts, jax.random.key(request.seed), plan.pairs, line, rest), sharding.replicated(mesh)
     )
 
     def make(first: int, wanted: int) -> dict[str, np.ndarray]:
         parts = []
         for low in range(first, first + wanted, count):
             # Those past the end are left out.
-            numbers = sharding.put(np.arange(low, low + count, dtype=np.uint32), sharding.along(mesh))
+            numbers = sharding.shard(np.arange(low, low + count, dtype=np.uint32), sharding.split_along(mesh))
             parts.append(jax.device_get(_draw(*held, numbers, jnp.float32(request.intensity))))
         marks, labels, person = (np.concatenate(field)[:wanted] for field in zip(*parts, strict=True))
         made = {"landmarks": marks, "labels": labels, "person": person}
@@ -161,7 +161,7 @@ def maker(
 
 
 @jax.jit
-def _draw(motion: generators.Params, beginnings: start_poses.Params, key, pairs, line, rest, numbers, intensity):
+def _draw(motion: generators.Generator, beginnings: start_poses.StartPoses, key, pairs, line, rest, numbers, intensity):
     """Landmarks (S, T, L, 3), labels (S, P + 1) and person (S,) of the sequences of these numbers (S,)."""
 
     def choose(key):
@@ -196,10 +196,10 @@ def _write(out: Path, number: int, made: dict[str, np.ndarray]) -> None:
     buffer = streams.BytesIO()
     np.savez(buffer, **made)
     data = buffer.getvalue()
-    with atomic.replacing(out / "shards" / f"{number:06d}.npz") as temporary:
+    with atomic.replace_file(out / "shards" / f"{number:06d}.npz") as temporary:
         temporary.write_bytes(data)
     record = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    with atomic.replacing(out / "done" / f"{number:06d}.json") as temporary:
+    with atomic.replace_file(out / "done" / f"{number:06d}.json") as temporary:
         temporary.write_text(json.dumps(record))
 
 
@@ -230,7 +230,7 @@ def _finish(out: Path, plan: _Plan) -> None:
     claim = dict(plan.claim)
     index = {"schema": corpora.SCHEMA, "unit": "mm", "rate": pipeline.RATE, "labels": claim.pop("known")}
     index |= {"people": list(claim["people"]), "length": claim.pop("length"), "request": claim, "shards": shards}
-    with atomic.replacing(out / "index.json") as temporary:
+    with atomic.replace_file(out / "index.json") as temporary:
         temporary.write_text(json.dumps(index))
 
 

@@ -29,7 +29,7 @@ class Expressions(NamedTuple):
     """One network per expression."""
 
     labels: tuple[str, ...]
-    params: expression_lstm.Params  # stacked, (E, ...)
+    params: expression_lstm.ExpressionLSTM  # stacked, (E, ...)
     config: expression_lstm.Config
     rate: float  # frames per second
     frames: int  # of the longest sequence that they learnt from, its tail included
@@ -64,7 +64,7 @@ def save(path: str | os.PathLike, networks: Expressions) -> None:
     weights.save(path, networks.params._replace(weights=halved), metadata=described)
 
 
-def network(networks: Expressions, label: str) -> expression_lstm.Params:
+def network(networks: Expressions, label: str) -> expression_lstm.ExpressionLSTM:
     """The network of one expression. Raises `ValueError` with the nearest names for one that has none."""
     if label not in networks.labels:
         near = difflib.get_close_matches(label, networks.labels, n=3, cutoff=0.4)
@@ -105,10 +105,10 @@ def displacements(
     )
     if not stop:
         return curve
-    return curve[..., : int(jnp.max(expression_lstm.ending(curve, fraction=stop))), :, :]
+    return curve[..., : int(jnp.max(expression_lstm.expression_length(curve, fraction=stop))), :, :]
 
 
-def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.Params:
+def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.ExpressionLSTM:
     """Shapes and dtypes of a file's tree."""
     size = config.landmarks * 3
     basis = None if config.components is None else jnp.zeros((size, config.components))
@@ -118,6 +118,6 @@ def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.Pa
     def stacked(dtype):
         return lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape), dtype)
 
-    return expression_lstm.Params(
+    return expression_lstm.ExpressionLSTM(
         jax.tree.map(stacked(jnp.float32), one.scale), jax.tree.map(stacked(jnp.float16), one.weights)
     )

@@ -30,7 +30,7 @@ class Motion(NamedTuple):
     notes: tuple[str, ...] = ()  # what was assumed, one line each
 
 
-def by_expression(
+def from_expression(
     label: str,
     neutral: np.ndarray | None = None,
     *,
@@ -52,7 +52,7 @@ def by_expression(
     return Motion(np.asarray(curve), label, ((0, label),), networks.rate)
 
 
-def by_labels(
+def from_labels(
     labels: Sequence[str], *, seed: int = 7, frames: int | Sequence[int] | str = 30, weights: Path | None = None
 ) -> Motion:
     """A generated motion through two or more labels; `frames` as in `pipeline.landmarks`, or "natural".
@@ -66,12 +66,12 @@ def by_labels(
     return Motion(np.asarray(curve), "_".join(labels), pipeline.captions(labels, frames=frames), pipeline.RATE)
 
 
-def by_recording(recording: livelink.Recording, *, name: str) -> Motion:
+def from_recording(recording: livelink.Recording, *, name: str) -> Motion:
     """The motion of the average face under a recording that is evenly sampled (`livelink.resample`)."""
     person, marks = makehuman.average(), makehuman.template().landmarks
     rest = person.vertices[marks]
     scale = float(np.linalg.norm(rest - rest.mean(axis=0)))
-    curve = (posed(recording, person)[:, marks] - rest) / scale
+    curve = (animate_person(recording, person)[:, marks] - rest) / scale
     return Motion(curve, name, ((0, name),), rate_of(recording), recording.notes)
 
 
@@ -101,7 +101,7 @@ def read_recording(
     return livelink.Recording(even.weights[chosen], even.head[chosen], times - times[0], gaps, tuple(notes))
 
 
-def posed(recording: livelink.Recording, person: makehuman.Subject, *, intensity: float = 1.0) -> np.ndarray:
+def animate_person(recording: livelink.Recording, person: makehuman.Subject, *, intensity: float = 1.0) -> np.ndarray:
     """A MakeHuman person under an evenly sampled recording, by blendshapes: skin, eyes and teeth, (T, M, 3) mm.
 
     `intensity` scales the weights.

@@ -83,8 +83,8 @@ def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: fl
     """
     if not rate > 0:
         raise ValueError(f"rate must be above 0 frames per second, got {rate}")
-    pairs = composition.pairs_of(_numbers(models, labels))
-    drawn = composition.draw(models.motion, models.starts, composition.keys_of(key, 1), pairs)
+    pairs = composition.label_pairs(_numbers(models, labels))
+    drawn = composition.draw(models.motion, models.starts, composition.sample_keys(key, 1), pairs)
     seconds = np.exp(np.asarray(drawn.log_seconds[0]))
     return tuple(max(2, 1 + round(float(x) * rate)) for x in seconds)
 
@@ -116,7 +116,7 @@ def meshes(
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
         raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
-    if isinstance(models.decoder, gpmm_residual.Params):
+    if isinstance(models.decoder, gpmm_residual.GPMMResidual):
         return jnp.asarray(neutral, jnp.float32) + gpmm_residual.apply(
             models.decoder, landmarks - rest, neutral, refined=refined, noise=noise
         )

@@ -25,7 +25,7 @@ FACING = 0.5  # the least cosine between the normals of a match
 REACH = 15.0  # mm from the template's surface to where the scan no longer moves with it
 
 
-class Shape(NamedTuple):
+class HeadModel(NamedTuple):
     """The morphable model of people at rest."""
 
     mean: np.ndarray  # (N, 3)
@@ -45,14 +45,16 @@ class Registration(NamedTuple):
     distance: np.ndarray  # (N,) mm to the scan, where matched
 
 
-class Carrier(NamedTuple):
+class Binding(NamedTuple):
     """How a scan hangs on the template."""
 
     faces: np.ndarray  # (V, 3) the template's vertices that each of the scan's hangs on
     weights: np.ndarray  # (V, 3), which fall to zero away from the template
 
 
-def shape(people: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, components: int = 80) -> Shape:
+def fit_head_model(
+    people: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, components: int = 80
+) -> HeadModel:
     """The model of people at rest (M, N, 3), each moved so that its landmarks lie on the mean's."""
     people = np.asarray(people, np.float64)
     mean = people.mean(axis=0)
@@ -64,11 +66,11 @@ def shape(people: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, 
     order = np.argsort(values)[::-1][: min(components, len(people) - 1)]
     # Of unit length once divided by the root of M times the value; times the deviation, the root of the value.
     rows = vectors[:, order].T @ flat / np.sqrt(len(people))
-    return Shape(mean, rows.reshape(len(order), *mean.shape), np.asarray(faces), np.asarray(landmark_index))
+    return HeadModel(mean, rows.reshape(len(order), *mean.shape), np.asarray(faces), np.asarray(landmark_index))
 
 
 def fit(
-    model: Shape,
+    model: HeadModel,
     vertices: np.ndarray,
     faces: np.ndarray,
     landmarks: np.ndarray,
@@ -100,22 +102,22 @@ def fit(
     return Registration(((found - move) @ turn).astype(np.float32), turn, move, coefficients, matched, distance)
 
 
-def carrier(registered: np.ndarray, faces: np.ndarray, scan: np.ndarray, scan_faces: np.ndarray) -> Carrier:
+def bind(registered: np.ndarray, faces: np.ndarray, scan: np.ndarray, scan_faces: np.ndarray) -> Binding:
     """Hang a scan's vertices (V, 3) on the registered template (N, 3)."""
     scan_faces = _oriented(np.asarray(scan_faces), scan, registered, faces)
     normals = closest_point.normals(scan, scan_faces)
-    hits = closest_point.query(closest_point.surface(registered, faces), scan, normals=normals, turn=REACH / 4)
+    hits = closest_point.closest_points(closest_point.surface(registered, faces), scan, normals=normals, turn=REACH / 4)
     t = np.clip(hits.distance / REACH, 0, 1)
     hold = 1 - t * t * (3 - 2 * t)
-    return Carrier(np.asarray(faces)[hits.face], (hits.weights * hold[:, None]).astype(np.float32))
+    return Binding(np.asarray(faces)[hits.face], (hits.weights * hold[:, None]).astype(np.float32))
 
 
-def carry(on: Carrier, displacements: np.ndarray) -> np.ndarray:
+def transfer_displacements(on: Binding, displacements: np.ndarray) -> np.ndarray:
     """Displacements (..., N, 3) of the template as those (..., V, 3) of the scan."""
     return np.einsum("vk,...vkx->...vx", on.weights, np.asarray(displacements)[..., on.faces, :])
 
 
-def _fit_model(model: Shape, scan: closest_point.Surface, marks: np.ndarray, at: np.ndarray, noise: float):
+def _fit_model(model: HeadModel, scan: closest_point.Surface, marks: np.ndarray, at: np.ndarray, noise: float):
     """The morphable model's face nearest to the scan (N, 3), and its coefficients."""
     coefficients, turn, move = np.zeros(len(model.components)), np.eye(3), np.zeros(3)
 
@@ -154,7 +156,7 @@ def _jacobian(points: np.ndarray, basis: np.ndarray, centre: np.ndarray) -> np.n
 
 
 def _refine(
-    model: Shape, start: np.ndarray, scan: closest_point.Surface, marks: np.ndarray, at: np.ndarray, noise: float
+    model: HeadModel, start: np.ndarray, scan: closest_point.Surface, marks: np.ndarray, at: np.ndarray, noise: float
 ):
     """Every vertex moved onto the scan, as smoothly as can be: vertices, which are matched, and how far they are."""
     count, here = len(start), start.copy()
@@ -176,7 +178,7 @@ def _refine(
         # A little of staying put keeps what is neither matched nor connected.
         system = data + stiff * smooth + 1e-4 * sparse.eye(3 * count, format="csc")
         here = start + splu(system.tocsc()).solve(right.ravel()).reshape(count, 3)
-    hits = closest_point.query(scan, here)
+    hits = closest_point.closest_points(scan, here)
     _, _, weight = _matches(here, model.faces, scan, FAR[1])
     return here, weight > 0, hits.distance
 
@@ -184,7 +186,7 @@ def _refine(
 def _matches(here: np.ndarray, faces: np.ndarray, scan: closest_point.Surface, far: float):
     """For each vertex the scan's nearest point (N, 3), its normal there, and a weight: 0 where nothing matches."""
     own = closest_point.normals(here, faces)
-    hits = closest_point.query(scan, here, normals=own, turn=far / 4)
+    hits = closest_point.closest_points(scan, here, normals=own, turn=far / 4)
     normals = closest_point.at(scan, hits, scan.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     facing = np.einsum("ni,ni->n", normals, own)
@@ -196,7 +198,7 @@ def _matches(here: np.ndarray, faces: np.ndarray, scan: closest_point.Surface, f
 def _oriented(scan_faces: np.ndarray, vertices: np.ndarray, template: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The scan's triangles (F, 3), running round the way the template's do."""
     scan = closest_point.surface(vertices, scan_faces)
-    hits = closest_point.query(scan, template)
+    hits = closest_point.closest_points(scan, template)
     close = hits.distance <= np.median(hits.distance)
     dots = np.einsum("ni,ni->n", closest_point.at(scan, hits, scan.normals), closest_point.normals(template, faces))
     return scan_faces[:, ::-1] if np.median(dots[close]) < 0 else scan_faces

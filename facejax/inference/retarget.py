@@ -93,7 +93,7 @@ def prepare(
     )
 
 
-def move(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0, head: bool = False) -> jax.Array:
+def animate(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0, head: bool = False) -> jax.Array:
     """Vertices (..., T, N, 3) in mm of a face that moves through displacements from neutral (..., T, 68, 3).
 
     With `head` the motion turns the head, too: its rigid part, that of the landmarks which stay put in a head

@@ -46,22 +46,22 @@ class Scan(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Worn(NamedTuple):
+class BoundScan(NamedTuple):
     """A scan that moves with the template; millimetres, y up, z forward."""
 
     name: str
     neutral: np.ndarray  # (N, 3) float32, the template on the scan
     still: np.ndarray  # (V, 3) float32
     faces: np.ndarray  # (F, 3)
-    hung: registration.Carrier
+    hung: registration.Binding
 
 
 @functools.cache
-def people() -> registration.Shape:
+def people() -> registration.HeadModel:
     """The morphable model of MakeHuman's people at rest; some seconds."""
     template = makehuman.template()
     drawn = [makehuman.subject(i, seed=PEOPLE_SEED).vertices for i in range(PEOPLE)]
-    return registration.shape(np.stack(drawn), template.faces, template.landmarks)
+    return registration.fit_head_model(np.stack(drawn), template.faces, template.landmarks)
 
 
 def read(path: Path, landmarks: Path) -> Scan:
@@ -113,18 +113,18 @@ def save(scan: Scan, found: registration.Registration, out: Path) -> tuple[list[
     """
     model = people()
     marks = found.vertices[model.landmark_index]
-    hits = closest_point.query(closest_point.surface(scan.vertices, scan.faces), marks)
+    hits = closest_point.closest_points(closest_point.surface(scan.vertices, scan.faces), marks)
     paths = [out / f"{scan.name}-{what}" for what in ("template.ply", "landmarks.json", "fit.json", "fit.png")]
     io.save(paths[0], found.vertices / scan.unit, model.faces)
     io.landmarks.write(paths[1], points=hits.points / scan.unit, names=schemes.by_count(68).points)
-    record = measured(scan, found)
-    with atomic.replacing(paths[2]) as temporary:
+    record = measure(scan, found)
+    with atomic.replace_file(paths[2]) as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n")
     render.save(paths[3], render.contact_sheet([pictures(scan, found)], column_labels=SHOWN))
-    return paths, scan.notes + remarks(record)
+    return paths, scan.notes + describe(record)
 
 
-def measured(scan: Scan, found: registration.Registration) -> dict[str, float]:
+def measure(scan: Scan, found: registration.Registration) -> dict[str, float]:
     """How well the template lies on a scan: distances in mm, the share of it that is matched, how unusual the face."""
     distance = found.distance[found.matched]
     off = np.linalg.norm(found.vertices[people().landmark_index[scan.which]] - scan.landmarks, axis=1)
@@ -138,7 +138,7 @@ def measured(scan: Scan, found: registration.Registration) -> dict[str, float]:
     }
 
 
-def remarks(record: dict[str, float]) -> tuple[str, ...]:
+def describe(record: dict[str, float]) -> tuple[str, ...]:
     """What to say of a registration."""
     notes = [f"{record['mean_mm']:.2f} mm from the scan in the mean, over the {record['matched']:.0%} that it covers"]
     if record["matched"] < COVERED:
@@ -154,8 +154,8 @@ def pictures(scan: Scan, found: registration.Registration) -> list[np.ndarray]:
     """The scan, the template on it, and how far the two are apart (`SHOWN`), (height, width, 3) uint8 each."""
     model = people()
     there, placed = (x @ found.turn.T + found.move for x in (scan.vertices, found.vertices))
-    camera = render.aim(placed, size=PICTURE, turn=18)
-    colours = render.heat(np.where(found.matched, found.distance, 0.0), high=RED)
+    camera = render.fit_camera(placed, size=PICTURE, turn=18)
+    colours = render.heat_colours(np.where(found.matched, found.distance, 0.0), high=RED)
     return [
         render.image(there, scan.faces, size=PICTURE, camera=camera),
         render.image(placed, model.faces, size=PICTURE, camera=camera),
@@ -163,18 +163,18 @@ def pictures(scan: Scan, found: registration.Registration) -> list[np.ndarray]:
     ]
 
 
-def wear(scan: Scan) -> tuple[Worn, tuple[str, ...]]:
+def bind_scan(scan: Scan) -> tuple[BoundScan, tuple[str, ...]]:
     """Register a scan, and hang it on the template, y up and z forward; and what there is to say of it."""
     found, faces_ = fit(scan), people().faces
     neutral, still = ((x @ found.turn.T + found.move).astype(np.float32) for x in (found.vertices, scan.vertices))
-    hung = registration.carrier(neutral, faces_, still, scan.faces)
-    return Worn(scan.name, neutral, still, scan.faces, hung), scan.notes + remarks(measured(scan, found))
+    hung = registration.bind(neutral, faces_, still, scan.faces)
+    return BoundScan(scan.name, neutral, still, scan.faces, hung), scan.notes + describe(measure(scan, found))
 
 
-def scene_of(models: pipeline.Models, worn: Worn, vertices: np.ndarray, marks: np.ndarray, labels, frames):
+def scene_of(models: pipeline.Models, worn: BoundScan, vertices: np.ndarray, marks: np.ndarray, labels, frames):
     """`results.scene_of` in the scan's own vertices: of the template's (T, N, 3) and landmarks (T, L, 3)."""
     rest = np.asarray(pipeline.neutral_landmarks(models, worn.neutral))
-    moved = worn.still + registration.carry(worn.hung, vertices - worn.neutral)
+    moved = worn.still + registration.transfer_displacements(worn.hung, vertices - worn.neutral)
     extras = (
         eyes_teeth.parts(eyes_teeth.template(), rest, marks)
         if eyes_teeth.has_eye_holes(worn.still, worn.faces, rest)

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-SAID = 1000  # characters of a message, or little more
+MAX_MESSAGE_CHARS = 1000  # characters of a message, or little more
 
 
 class FileError(ValueError):
@@ -21,13 +21,13 @@ class FileError(ValueError):
 def one_line(text: object) -> str:
     """A text in one line, without what a terminal would act on; of a very long one the beginning and the end."""
     text = str(text)
-    if len(text) > SAID:
-        text = f"{text[: SAID // 2]} ... {text[-SAID // 2 :]}"
+    if len(text) > MAX_MESSAGE_CHARS:
+        text = f"{text[: MAX_MESSAGE_CHARS // 2]} ... {text[-MAX_MESSAGE_CHARS // 2 :]}"
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
+def replace_file(path: str | os.PathLike) -> Iterator[Path]:
     """Gives a temporary path in the same folder, of the same suffix; on success it takes the place of `path`.
 
     The folder is made if it is missing. An error or an interruption inside leaves an older file untouched.
@@ -48,7 +48,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
+def replace_folder(path: str | os.PathLike) -> Iterator[Path]:
     """The same for a folder: what was there before is removed only once the new one is complete."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

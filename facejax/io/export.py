@@ -43,7 +43,7 @@ def save(
       extras: parts beside the face, see `scene.Part`.
       colours: (N, 3) sRGB in [0, 1]; also (T, N, 3) in pictures.
       size: (width, height) of pictures.
-      camera: of pictures, see `render.aim`.
+      camera: of pictures, see `render.fit_camera`.
 
     Raises:
       ValueError: unknown suffix, a scene out of order, or an animation in a format for one mesh.
@@ -62,7 +62,7 @@ def save(
     elif suffix in video.FORMATS or suffix == ".png":
         if suffix != ".png":
             video.check(path)
-        view = render.aim(shot.vertices, size=size) if camera is None else camera
+        view = render.fit_camera(shot.vertices, size=size) if camera is None else camera
         look = {"size": size, "camera": view}
         if suffix == ".png":
             _write_picture(path, shot, colours, look)
@@ -98,7 +98,7 @@ def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
     if count > 1:
         labels = [_label(t, shot.captions) for t in chosen]
         pictures = [render.contact_sheet([pictures], column_labels=labels)]
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         Image.fromarray(pictures[0]).save(temporary)
 
 
@@ -114,5 +114,5 @@ def _write_arrays(path: Path, shot: scene.Scene) -> None:
     arrays = {"vertices": shot.vertices, "faces": shot.faces.astype(np.int32), "fps": np.float64(shot.fps)}
     if shot.landmarks is not None:
         arrays["landmarks"] = shot.landmarks
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         np.savez(temporary, **arrays)

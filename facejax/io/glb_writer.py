@@ -53,7 +53,7 @@ def write(
     ]:
         if not len(triangles):
             raise ValueError(f"{label}: glTF needs at least one triangle")
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_bytes(_glb(*_document(film, str(name), normals, sparse)))
 
 

@@ -99,7 +99,7 @@ def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> No
     record = {"indices" if points is None else "points": values.tolist()}
     if names is not None:
         record["names"] = _names(list(names), len(values))
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text(json.dumps(record), encoding="utf-8")
 
 

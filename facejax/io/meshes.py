@@ -120,7 +120,7 @@ def write(path: str | os.PathLike, vertices, faces=None) -> None:
     faces = np.zeros((0, 3), np.int32) if faces is None else np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         writer(temporary, vertices, faces.astype(np.int32))
 
 

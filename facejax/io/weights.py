@@ -50,7 +50,7 @@ def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None
     arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
     header = {_HEADER: json.dumps(metadata or {}, sort_keys=True)}
     data = _serialise(arrays, metadata=header)
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_bytes(data)
 
 

@@ -58,7 +58,7 @@ def surface(vertices: np.ndarray, faces: np.ndarray, *, seed: int = 0) -> Surfac
     return Surface(vertices, faces, normals(vertices, faces), edge, cKDTree(samples), cKDTree(both), owner)
 
 
-def query(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, turn: float = 0.0) -> Hits:
+def closest_points(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, turn: float = 0.0) -> Hits:
     """The nearest point of the surface to each of `points` (P, 3).
 
     With their `normals` (P, 3), a triangle that looks the other way counts as farther: by twice `turn`.

@@ -18,7 +18,7 @@ HOLD = 1e-4  # of an average triangle's area, for a vertex that never moves
 STILL = 0.05  # mm, root mean square: a vertex that moves much more is held much less
 
 
-def gradient(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
+def gradient_operator(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
     """The operator from vertex values (N,) to constant gradients per triangle (3F,), and the areas (F,).
 
     Raises `ValueError` for a triangle without area, on which nothing has a gradient.
@@ -39,7 +39,7 @@ def gradient(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix
     return sum(parts[1:], parts[0]), double[:, 0] / 2
 
 
-class Carrier:
+class DeformationTransfer:
     """From one face to another; built once per pair of faces, then `carrier(fields)`."""
 
     def __init__(self, source: np.ndarray, target: np.ndarray, faces: np.ndarray, motion: np.ndarray):
@@ -53,8 +53,8 @@ class Carrier:
                 f"expected two faces of one shape and a motion per vertex, got {source.shape}, {target.shape} "
                 f"and {np.shape(motion)}"
             )
-        self._from, _ = gradient(source, faces)
-        into, areas = gradient(target, faces)
+        self._from, _ = gradient_operator(source, faces)
+        into, areas = gradient_operator(target, faces)
         self._into = (into.T @ sparse.diags(np.repeat(areas, 3))).tocsr()
         self._hold = sparse.diags(HOLD * areas.mean() / (1 + (np.asarray(motion) / STILL) ** 2))
         self._solve = splu((self._into @ into + self._hold).tocsc()).solve
@@ -67,7 +67,7 @@ class Carrier:
         return np.moveaxis(carried.reshape(count, batch, 3), 0, 1)
 
 
-def settle(there: Carrier, back: Carrier, fields: np.ndarray, *, rounds: int = 2) -> np.ndarray:
+def invert(there: DeformationTransfer, back: DeformationTransfer, fields: np.ndarray, *, rounds: int = 2) -> np.ndarray:
     """The fields at the far end of `there` that come `back` as the given ones (B, N, 3).
 
     To go and come back does not give the same field, since two faces' triangles lie in different planes. What is

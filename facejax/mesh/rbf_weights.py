@@ -5,7 +5,7 @@ distance to their nearest other; their spread is their root mean square distance
 
 `weights` makes a warp by `geometry.rbf` fit for faces. Bare radial functions fail them in two places: they carry the
 jaw's motion on to neck and skull, which `falloff` ends; and they know distances through space alone, in which closed
-lips are one, so that a mouth stays filled with skin when it opens, which `side` prevents. On makehuman4d's validation
+lips are one, so that a mouth stays filled with skin when it opens, which `upper_lip_share` prevents. On makehuman4d's validation
 subjects the two together bring the mean error of the head from 0.76 to 0.25 mm, of the face from 0.39 to 0.29 mm and of
 the rim of the mouth from 1.20 to 0.59 mm (`experiments.rbf_warp`).
 """
@@ -50,7 +50,9 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
         )
 
 
-def rim(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH) -> np.ndarray:
+def distant_boundary(
+    vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH
+) -> np.ndarray:
     """The vertices (P,) of the boundary that are farther than `reach` spacings from every landmark (L, 3).
 
     On a head the edge of the neck; of a mask cut out of a face the parts of its edge that no landmark moves. The edges
@@ -68,13 +70,13 @@ def rim(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach
 def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH) -> np.ndarray:
     """Factors (N,) float32 in [0, 1], by which the rows of `geometry.rbf.weights` let go of what landmarks do not move.
 
-    1 at a landmark; 0 on the `rim` and wherever else it is as far to the nearest landmark (L, 3) as from the rim's
+    1 at a landmark; 0 on the `distant_boundary` and wherever else it is as far to the nearest landmark (L, 3) as from the rim's
     nearest vertex; the smooth step of that distance between. Against Seo & Luo's (2021, section 5) unstable boundary,
     and for a skull that stays where it is. It would hold back the motion of the whole head: take that out first
     (`geometry.align.procrustes`). 1 everywhere on a closed mesh, whose end nothing marks.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
-    pinned = rim(vertices, faces, landmarks, reach=reach)
+    pinned = distant_boundary(vertices, faces, landmarks, reach=reach)
     if len(pinned) == 0:
         return np.ones(len(vertices), np.float32)
     distance = cKDTree(landmarks).query(vertices)[0]
@@ -82,7 +84,7 @@ def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, r
     return (1 - t * t * (3 - 2 * t)).astype(np.float32)
 
 
-def side(
+def upper_lip_share(
     vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]]
 ) -> np.ndarray:
     """The share (N,) in [0, 1] that the upper of two lips has of each vertex: 1 above, 0 below, between at the corners.
@@ -101,12 +103,12 @@ def side(
     return (t * t * (3 - 2 * t)).astype(np.float32)
 
 
-def parted(
+def split_lips(
     vertices: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]], share: np.ndarray, **options
 ) -> np.ndarray:
     """Weights (N, L) float32 of two fits: one without the lower lip's landmarks, one without the upper's.
 
-    `share` (N,), from `side`, is the first one's part of each vertex. Landmarks are met and affine motions carried on
+    `share` (N,), from `upper_lip_share`, is the first one's part of each vertex. Landmarks are met and affine motions carried on
     as by each of the two; options as of `geometry.rbf.fit`.
     """
     found = np.zeros((len(vertices), len(landmarks)), np.float32)
@@ -137,11 +139,13 @@ def weights(
     if lips is None:
         found = rbf.weights(rbf.fit(landmarks, **options), vertices)
     else:
-        found = parted(vertices, landmarks, lips, side(vertices, faces, landmarks, lips), **options)
+        found = split_lips(vertices, landmarks, lips, upper_lip_share(vertices, faces, landmarks, lips), **options)
     return found * falloff(vertices, faces, landmarks, reach=reach)[:, None]
 
 
-def region(vertices: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, within: float = 25.0) -> np.ndarray:
+def face_region(
+    vertices: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, within: float = 25.0
+) -> np.ndarray:
     """The face of a head: a mask (N,) of the vertices `within` so many mm of a landmark's vertex, along the surface."""
     return graph.geodesic(vertices, faces, landmark_index) <= within
 

@@ -35,13 +35,13 @@ def build(
         sizes = [len(_walk(v, ring[0], around, rings=rings)[::dilation]) for v, ring in enumerate(around)]
         length = max(1, int(np.mean(sizes) + 2 * np.std(sizes)))
     table = np.full((len(vertices), length), len(vertices), np.int32)
-    for vertex, first in enumerate(starts(vertices, faces, around, reference)):
+    for vertex, first in enumerate(first_neighbours(vertices, faces, around, reference)):
         spiral = _walk(vertex, first, around, count=1 + (length - 1) * dilation)[::dilation]
         table[vertex, : len(spiral)] = spiral[:length]
     return table
 
 
-def starts(vertices: np.ndarray, faces: np.ndarray, around: list[list[int]], reference: int) -> np.ndarray:
+def first_neighbours(vertices: np.ndarray, faces: np.ndarray, around: list[list[int]], reference: int) -> np.ndarray:
     """Each vertex's first neighbour (N,): the predecessor on the shortest path from the reference.
 
     A component that no path reaches takes its own vertex nearest to the reference as its reference. A

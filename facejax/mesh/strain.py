@@ -16,7 +16,7 @@ import numpy as np
 from facejax.mesh import normals
 
 
-class Around(NamedTuple):
+class VertexTriangles(NamedTuple):
     """The triangles, and which of them meet at each vertex."""
 
     faces: np.ndarray  # (F, 3) int32
@@ -24,7 +24,7 @@ class Around(NamedTuple):
     count: np.ndarray  # (N,) float32
 
 
-def around(faces: np.ndarray, count: int) -> Around:
+def vertex_triangles(faces: np.ndarray, count: int) -> VertexTriangles:
     """The tables of triangles (F, 3) on `count` vertices."""
     owner = np.argsort(faces.ravel(), kind="stable")
     vertex = faces.ravel()[owner]
@@ -32,11 +32,11 @@ def around(faces: np.ndarray, count: int) -> Around:
     place = np.arange(len(vertex)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     about = np.full((count, sizes.max()), len(faces), np.int32)
     about[vertex, place] = owner // 3
-    return Around(np.asarray(faces, np.int32), about, np.maximum(sizes, 1).astype(np.float32))
+    return VertexTriangles(np.asarray(faces, np.int32), about, np.maximum(sizes, 1).astype(np.float32))
 
 
 @jax.jit
-def strain(displacements: jax.Array, neutral: jax.Array, tables: Around) -> tuple[jax.Array, jax.Array]:
+def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles) -> tuple[jax.Array, jax.Array]:
     """Strain (N, B, 6) and the neutral face's unit normals (N, B, 3), of (N, B, 3) and (N, B, 3).
 
     Strain has no unit: 0.1 is a tenth longer; xx, yy, zz, xy, xz, yz in the axes of the mesh. Both are 0 where the

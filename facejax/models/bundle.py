@@ -42,10 +42,10 @@ class Models(NamedTuple):
 
     labels: tuple[str, ...]  # neutral first
     face: Face
-    motion: generators.Params
-    starts: start_poses.Params  # peaks from which a motion starts that does not start at neutral
+    motion: generators.Generator
+    starts: start_poses.StartPoses  # peaks from which a motion starts that does not start at neutral
     hierarchy: mesh_hierarchy.Hierarchy
-    decoder: s2d_dec.Params | gpmm_residual.Params  # S2D-Dec, or the best linear answer refined
+    decoder: s2d_dec.S2DDec | gpmm_residual.GPMMResidual  # S2D-Dec, or the best linear answer refined
     about: dict[str, Any]  # how the weights were made
 
 
@@ -67,7 +67,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
         raise weights.WeightsError(f"{path}: {error}") from error
     # The face stays on the host: it is read by exporters, not by networks.
     networks = ["motion", "starts", "hierarchy"]
-    networks += ["decoder"] if isinstance(tree["decoder"], s2d_dec.Params) else []
+    networks += ["decoder"] if isinstance(tree["decoder"], s2d_dec.S2DDec) else []
     moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in networks}
     return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
 
@@ -75,7 +75,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
 def save(path: str | os.PathLike, models: Models) -> None:
     """Write models to one safetensors file; `about` gains what `load` needs."""
     tree = models._asdict()
-    refined = isinstance(models.decoder, gpmm_residual.Params)
+    refined = isinstance(models.decoder, gpmm_residual.GPMMResidual)
     about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
     about["decoder"] = REFINED if refined else S2D
     tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)
@@ -98,13 +98,13 @@ def _structure(shapes: dict[str, list], generator: str) -> dict[str, Any]:
         networks[name] = _listed(nested[name].get("weights", {}))
     tree = {
         "face": Face(**nested["face"]),
-        "motion": generators.KINDS[generator](tangent_pca.Chart(**nested["motion"]["chart"]), networks["motion"]),
-        "starts": start_poses.Params(**nested["starts"]),
+        "motion": generators.KINDS[generator](tangent_pca.TangentPCA(**nested["motion"]["chart"]), networks["motion"]),
+        "starts": start_poses.StartPoses(**nested["starts"]),
         "hierarchy": tables,
         "decoder": (
             _listed(nested["decoder"])
             if "base" in nested["decoder"]
-            else s2d_dec.Params(s2d_dec.Scale(**nested["decoder"]["scale"]), networks["decoder"])
+            else s2d_dec.S2DDec(s2d_dec.Scale(**nested["decoder"]["scale"]), networks["decoder"])
         ),
     }
     # Files of versions before 0.2 hold the template's eyes and teeth too; `load` leaves them out.

@@ -46,20 +46,20 @@ class Scale(NamedTuple):
     basis: jax.Array | None  # (3 L, C) orthonormal columns, or None: no PCA
 
 
-class Params(NamedTuple):
+class ExpressionLSTM(NamedTuple):
     """The constants, and the weights that are trained (`facejax.models.lstm`)."""
 
     scale: Scale
     weights: lstm.Weights
 
 
-def init(key: jax.Array, scale: Scale, *, config: Config = Config()) -> Params:
+def init(key: jax.Array, scale: Scale, *, config: Config = Config()) -> ExpressionLSTM:
     """Random weights whose predictions nearly stand still. Raises `ValueError` for sizes that do not fit the scale."""
     expected = (config.landmarks, 3)
     if scale.neutral_mean.shape != expected:
         raise ValueError(f"scale: expected neutral_mean {expected}, got {scale.neutral_mean.shape}")
     size = 3 * config.landmarks if scale.basis is None else scale.basis.shape[1]
-    return Params(scale, lstm.init(key, size, hidden=config.hidden, layers=config.layers))
+    return ExpressionLSTM(scale, lstm.init(key, size, hidden=config.hidden, layers=config.layers))
 
 
 def measure(steps: np.ndarray, mask: np.ndarray, neutral: np.ndarray, *, config: Config = Config()) -> Scale:
@@ -87,7 +87,7 @@ def measure(steps: np.ndarray, mask: np.ndarray, neutral: np.ndarray, *, config:
 
 
 @jax.jit
-def predict(params: Params, steps: jax.Array, neutral: jax.Array | None = None) -> jax.Array:
+def predict(params: ExpressionLSTM, steps: jax.Array, neutral: jax.Array | None = None) -> jax.Array:
     """The step that follows each of the true steps (..., T, L, 3), as (..., T, L, 3): teacher forcing.
 
     The first of `steps` is the zero of a block (`facejax.data.sequences.block`). `neutral` (..., L, 3) takes its
@@ -99,7 +99,9 @@ def predict(params: Params, steps: jax.Array, neutral: jax.Array | None = None) 
 
 
 @jax.jit
-def follow(params: Params, steps: jax.Array, given: jax.Array, neutral: jax.Array | None = None) -> jax.Array:
+def predict_scheduled(
+    params: ExpressionLSTM, steps: jax.Array, given: jax.Array, neutral: jax.Array | None = None
+) -> jax.Array:
     """As `predict`, but where `given` (..., T) is false the network reads its own last prediction.
 
     The first step is always given. Gradients run through what was fed back.
@@ -110,14 +112,14 @@ def follow(params: Params, steps: jax.Array, given: jax.Array, neutral: jax.Arra
     carry = jax.lax.stop_gradient(params.scale.carry)
 
     def inside(x, base, given):
-        return lstm.follow(params.weights, x, given[..., 0], base, carry)
+        return lstm.forward_scheduled(params.weights, x, given[..., 0], base, carry)
 
     return _decode(params, _side_by_side(inside, x, base, given[..., None]))
 
 
 @partial(jax.jit, static_argnames="frames")
 def generate(
-    params: Params,
+    params: ExpressionLSTM,
     neutral: jax.Array | None = None,
     prefix: jax.Array | None = None,
     *,
@@ -127,7 +129,7 @@ def generate(
     """A curve (..., frames, L, 3) that starts at 0, made by the network that reads its own output.
 
     `neutral` (..., L, 3) as in `predict`. `prefix` (..., P, L, 3) is the beginning of a true curve, its first frame
-    included: it is read, kept, and gone on from. With `stop` the face stands still from where `ending` finds the
+    included: it is read, kept, and gone on from. With `stop` the face stands still from where `expression_length` finds the
     expression to be over; 0 never stops.
     """
     shape = params.scale.neutral_mean.shape
@@ -140,17 +142,17 @@ def generate(
         _check(params, prefix, "prefix")
         # Entry t holds the step that led to frame t, as in a training block.
         steps = steps.at[..., 1:known, :, :].set(jnp.diff(prefix, axis=-3)[..., : frames - 2, :, :])
-    made = follow(params, steps, jnp.arange(frames - 1) < known, neutral)
+    made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
     if prefix is not None:
         made = made.at[..., : known - 1, :, :].set(jnp.diff(prefix, axis=-3))
     curve = jnp.cumsum(jnp.concatenate([jnp.zeros((*lead, 1, *shape)), made], axis=-3), axis=-3)
-    last = jnp.where(stop > 0, ending(curve, fraction=stop), frames) - 1
+    last = jnp.where(stop > 0, expression_length(curve, fraction=stop), frames) - 1
     place = jnp.minimum(jnp.arange(frames), last[..., None])
     return jnp.take_along_axis(curve, place[..., None, None], axis=-3)
 
 
 @jax.jit
-def ending(curve: jax.Array, *, fraction: float = 0.01) -> jax.Array:
+def expression_length(curve: jax.Array, *, fraction: float = 0.01) -> jax.Array:
     """How many frames (...) of curves (..., T, L, 3) belong to the expression; T where it is not over.
 
     It is over at the first frame that is nearer to the start than 0.3 of the farthest one before it, and from which
@@ -169,7 +171,7 @@ def ending(curve: jax.Array, *, fraction: float = 0.01) -> jax.Array:
     return jnp.where(jnp.any(over, axis=-1), jnp.argmax(over, axis=-1) + 1, curve.shape[-3])
 
 
-def _encode(params: Params, steps: jax.Array, neutral: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+def _encode(params: ExpressionLSTM, steps: jax.Array, neutral: jax.Array | None) -> tuple[jax.Array, jax.Array]:
     """Steps (..., T, L, 3) as the network's numbers (..., T, D), the neutral landmarks in place of the first; and what
     its outputs are added to, the steps or nothing."""
     scale = jax.lax.stop_gradient(params.scale)
@@ -184,7 +186,7 @@ def _encode(params: Params, steps: jax.Array, neutral: jax.Array | None) -> tupl
     return x, base
 
 
-def _decode(params: Params, y: jax.Array) -> jax.Array:
+def _decode(params: ExpressionLSTM, y: jax.Array) -> jax.Array:
     scale = jax.lax.stop_gradient(params.scale)
     if scale.basis is not None:
         y = y @ scale.basis.T
@@ -199,7 +201,7 @@ def _side_by_side(function, *arrays: jax.Array) -> jax.Array:
     return out.reshape(*lead, *out.shape[1:])
 
 
-def _check(params: Params, steps: jax.Array, name: str) -> None:
+def _check(params: ExpressionLSTM, steps: jax.Array, name: str) -> None:
     expected = params.scale.neutral_mean.shape
     if steps.ndim < 3 or steps.shape[-2:] != expected:
         raise ValueError(f"{name}: expected (..., T, {expected[0]}, 3), got {steps.shape}")

@@ -53,7 +53,7 @@ def forward(weights: Weights, x: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def follow(
+def forward_scheduled(
     weights: Weights, x: jax.Array, given: jax.Array, base: jax.Array | None = None, carry: float | jax.Array = 0.0
 ) -> jax.Array:
     """Outputs (T, B, D) where an input is x (T, B, D) if `given` (T, B), else the output of the step before.
@@ -75,7 +75,7 @@ def step(weights: Weights, states: list[tuple[jax.Array, jax.Array]], x: jax.Arr
     return found, _dense(weights["dense"], x)
 
 
-def start(weights: Weights, count: int) -> list[tuple[jax.Array, jax.Array]]:
+def init_states(weights: Weights, count: int) -> list[tuple[jax.Array, jax.Array]]:
     """The states of `count` sequences before their first step."""
     rest = [jnp.zeros((count, row["hidden"].shape[0]), row["hidden"].dtype) for row in weights["layers"]]
     return [(zero, zero) for zero in rest]
@@ -215,6 +215,6 @@ def _unroll(weights: Weights, x, given, base, carry: jax.Array, added: list[jax.
         last = carried + _dense(weights["dense"], signal) + added_last
         return (found, last), (last, fed, [hidden for hidden, _ in found])
 
-    begin = (start(weights, x.shape[1]), jnp.zeros_like(x[0]))
+    begin = (init_states(weights, x.shape[1]), jnp.zeros_like(x[0]))
     _, (outputs, fed, hidden) = jax.lax.scan(advance, begin, (x, given, base, added))
     return outputs, (fed, hidden)

@@ -32,7 +32,7 @@ ROUNDING = 1e-6  # of a share of variance, from parameters in float32
 PRECISION = jax.lax.Precision.HIGHEST  # GPUs multiply float32 with ten bits of mantissa unless told otherwise
 
 
-class Params(NamedTuple):
+class MorphableModel(NamedTuple):
     """mean + sum_i coefficients[i] deviation[i] components[i]."""
 
     mean: jax.Array  # (N, C)
@@ -41,14 +41,14 @@ class Params(NamedTuple):
     total_variance: jax.Array  # (), of all directions, summed over vertices
 
 
-class TwoParams(NamedTuple):
+class IdentityExpressionModel(NamedTuple):
     """Neutral faces, and displacements from them: C = 3."""
 
-    identity: Params
-    expression: Params
+    identity: MorphableModel
+    expression: MorphableModel
 
 
-def fit(examples: np.ndarray, *, components: int) -> Params:
+def fit(examples: np.ndarray, *, components: int) -> MorphableModel:
     """Mean and principal components of examples (M, N, C), by a thin singular value decomposition.
 
     Directions in which nothing varies are no components, so that there may be fewer than asked for. Examples have to
@@ -60,13 +60,13 @@ def fit(examples: np.ndarray, *, components: int) -> Params:
 
 
 @jax.jit
-def apply(params: Params, coefficients: jax.Array) -> jax.Array:
+def apply(params: MorphableModel, coefficients: jax.Array) -> jax.Array:
     """Values (..., N, C) of faces with coefficients (..., k) in standard deviations; zero is the mean."""
     return _apply(params, "coefficients", coefficients)
 
 
 @jax.jit
-def project(params: Params, values: jax.Array) -> jax.Array:
+def project(params: MorphableModel, values: jax.Array) -> jax.Array:
     """Coefficients (..., k) of the faces nearest to values (..., N, C): `apply` of them is the orthogonal projection.
 
     Coefficients far beyond 3 say that these are no faces like the examples; nothing holds them back.
@@ -104,7 +104,9 @@ def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -
     return jnp.asarray(total / np.sum(centred**2) if unit else total, jnp.float32)
 
 
-def fit_two(neutral: np.ndarray, displacements: np.ndarray, *, identity: int, expression: int) -> TwoParams:
+def fit_two(
+    neutral: np.ndarray, displacements: np.ndarray, *, identity: int, expression: int
+) -> IdentityExpressionModel:
     """Identity and expression apart, with so many components each.
 
     From neutral faces (P, N, 3), one per subject, and from F frames' displacements (F, N, 3), each from its own
@@ -119,13 +121,13 @@ def fit_two(neutral: np.ndarray, displacements: np.ndarray, *, identity: int, ex
             "neutral and displacements: expected (P, N, 3) and (F, N, 3) with one N, "
             f"got {neutral.shape} and {displacements.shape}"
         )
-    return TwoParams(
+    return IdentityExpressionModel(
         _fit("neutral", neutral, "identity", identity), _fit("displacements", displacements, "expression", expression)
     )
 
 
 @jax.jit
-def face(two: TwoParams, identity: jax.Array, expression: jax.Array) -> jax.Array:
+def face(two: IdentityExpressionModel, identity: jax.Array, expression: jax.Array) -> jax.Array:
     """Vertices (..., N, 3) in mm, of identity coefficients (..., k) and expression coefficients (..., l).
 
     Their leading axes broadcast: one identity does for all frames. Zero expression coefficients are the mean
@@ -139,12 +141,12 @@ def face(two: TwoParams, identity: jax.Array, expression: jax.Array) -> jax.Arra
     return _apply(two.identity, "identity", identity) + _apply(two.expression, "expression", expression)
 
 
-def variance_kept(params: Params) -> np.ndarray:
+def variance_kept(params: MorphableModel) -> np.ndarray:
     """Share of the examples' variance (k,) that the first 1 ... k components keep, float64 on the host."""
     return np.cumsum(np.square(params.deviation, dtype=np.float64)) / np.float64(params.total_variance)
 
 
-def components_for(params: Params, share: float) -> int:
+def components_for(params: MorphableModel, share: float) -> int:
     """The least number of components that keep a share of the variance, such as 0.99.
 
     Raises `ValueError` for a share that is not in (0, 1], or that all k components do not keep.
@@ -158,7 +160,7 @@ def components_for(params: Params, share: float) -> int:
     return int(np.argmax(enough)) + 1
 
 
-def _fit(name: str, examples: np.ndarray, option: str, components: int) -> Params:
+def _fit(name: str, examples: np.ndarray, option: str, components: int) -> MorphableModel:
     """`fit`, with the caller's own names for what is wrong."""
     count = len(examples)
     if not 1 <= components < count:
@@ -178,10 +180,10 @@ def _fit(name: str, examples: np.ndarray, option: str, components: int) -> Param
         singular[:k] / np.sqrt(count),
         np.sum(singular**2) / count,
     )
-    return Params(*(jnp.asarray(x, jnp.float32) for x in fitted))
+    return MorphableModel(*(jnp.asarray(x, jnp.float32) for x in fitted))
 
 
-def _apply(params: Params, name: str, coefficients: jax.Array) -> jax.Array:
+def _apply(params: MorphableModel, name: str, coefficients: jax.Array) -> jax.Array:
     """`apply`, with the caller's own name for the coefficients."""
     if jnp.shape(coefficients)[-1:] != params.deviation.shape:
         raise ValueError(f"{name}: expected (..., {len(params.deviation)}), got {jnp.shape(coefficients)}")

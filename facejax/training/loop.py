@@ -26,7 +26,7 @@ from jax.sharding import Mesh
 
 from facejax.training import sharding
 from facejax.training.checkpoints import Checkpoints
-from facejax.training.metric_logger import Journal, Silent
+from facejax.training.metric_logger import MetricLogger, NullLogger
 
 Tree = Any
 Metrics = dict[str, jax.Array]
@@ -69,7 +69,7 @@ def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.n
     return indices
 
 
-def gathered(step: Step) -> Step:
+def gather_batches(step: Step) -> Step:
     """Let `step` take indices as its batch and (data, constants) as constants: data stay on the device."""
     return lambda state, indices, held: step(state, jax.tree.map(lambda leaf: leaf[indices], held[0]), held[1])
 
@@ -117,7 +117,7 @@ def run(
         return jax.lax.scan(lambda state, batch: step(state, batch, constants), state, data)
 
     # Whole on every device, so that any process can read what comes out.
-    laid_out = {} if mesh is None else {"out_shardings": sharding.everywhere(mesh)}
+    laid_out = {} if mesh is None else {"out_shardings": sharding.replicated(mesh)}
     advance = jax.jit(several, donate_argnums=0, **laid_out)
     with _Saved(folder / "checkpoints", keep) as saved, _stop_signals() as stopped:
         if not resume and saved.latest is not None:
@@ -130,18 +130,22 @@ def run(
                 f"{folder} holds a run of {done} steps, more than {steps}: ask for more, or name another folder"
             )
         if mesh is not None:
-            whole, split = sharding.everywhere(mesh), sharding.along(mesh, 1)
-            state, constants = sharding.put(state, whole), sharding.put(constants, whole)
+            whole, split = sharding.replicated(mesh), sharding.split_along(mesh, 1)
+            state, constants = sharding.shard(state, whole), sharding.shard(constants, whole)
 
         def prepared(first: int) -> Tree:
             data = batches(first, min(chunk - first % chunk, steps - first))
             if mesh is None:
                 return data
-            sharding.check_shared(data, mesh, 1)
-            return sharding.put(data, split)
+            sharding.check_divisible(data, mesh, 1)
+            return sharding.shard(data, split)
 
         saved_at, stopping = time.monotonic(), False
-        with Journal(folder, done, steps, tensorboard=tensorboard) if sharding.is_first() else Silent() as journal:
+        with (
+            MetricLogger(folder, done, steps, tensorboard=tensorboard)
+            if sharding.is_primary()
+            else NullLogger() as journal
+        ):
             data = prepared(done) if done < steps else None
             while done < steps and not stopping:
                 began = time.monotonic()
@@ -153,7 +157,7 @@ def run(
                         data = prepared(done)
                     metrics = jax.device_get(metrics)
                     # A step that only some of them take would never end.
-                    stopping = bool(sharding.most(len(stopped)))
+                    stopping = bool(sharding.max_over_processes(len(stopped)))
                 _check(metrics, first, limit, saved.latest, folder)
                 means = {name: float(np.mean(values, dtype=np.float64)) for name, values in metrics.items()}
                 try:
@@ -167,16 +171,16 @@ def run(
                     saved_at = time.monotonic()
     if stopping or stopped:
         raise KeyboardInterrupt if stopped == [signal.SIGINT] else SystemExit(128 + (stopped or [signal.SIGTERM])[0])
-    return sharding.take(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
+    return sharding.unshard(state) if any(len(leaf.devices()) > 1 for leaf in jax.tree.leaves(state)) else state
 
 
 class _Saved:
     """The checkpoints of a run that several processes may share: the first one reads and writes."""
 
     def __init__(self, folder: Path, keep: int):
-        self._checkpoints = Checkpoints(folder, keep=keep) if sharding.is_first() else None
+        self._checkpoints = Checkpoints(folder, keep=keep) if sharding.is_primary() else None
         found = self._checkpoints.latest() if self._checkpoints else None
-        number = sharding.from_first(np.int32(-1 if found is None else found))
+        number = sharding.broadcast_from_primary(np.int32(-1 if found is None else found))
         self.latest: int | None = None if number < 0 else int(number)
 
     def __enter__(self) -> "_Saved":
@@ -195,12 +199,12 @@ class _Saved:
         if self.latest is None:
             return state
         if self._checkpoints:
-            state = sharding.take(self._checkpoints.restore(state, step=self.latest))
-        return sharding.from_first(state)
+            state = sharding.unshard(self._checkpoints.restore(state, step=self.latest))
+        return sharding.broadcast_from_primary(state)
 
     def save(self, step: int, state: TrainState) -> None:
         if self._checkpoints:
-            self._checkpoints.save(step, sharding.take(state) if jax.process_count() > 1 else state)
+            self._checkpoints.save(step, sharding.unshard(state) if jax.process_count() > 1 else state)
         self.latest = step
 
 

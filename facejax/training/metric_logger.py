@@ -15,7 +15,7 @@ from facejax.io import atomic
 _QUIET = 10.0  # seconds between two plain lines
 
 
-class Journal:
+class MetricLogger:
     """Appends to `folder/metrics.jsonl` and shows progress; a context manager.
 
     Entries past step `done` are cut away first: a run that was killed wrote them after its last checkpoint.
@@ -44,7 +44,7 @@ class Journal:
             self._task = self._bar.add_task(folder.name, total=steps, completed=done, note="")
             self._bar.start()
 
-    def __enter__(self) -> "Journal":
+    def __enter__(self) -> "MetricLogger":
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
@@ -74,10 +74,10 @@ class Journal:
             print(f"step {step}/{self._steps}  {note}", file=sys.stderr, flush=True)
 
 
-class Silent:
+class NullLogger:
     """A journal that keeps nothing, for processes that only help."""
 
-    def __enter__(self) -> "Silent":
+    def __enter__(self) -> "NullLogger":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -99,7 +99,7 @@ def read(folder: str | os.PathLike) -> list[dict[str, float]]:
     return entries
 
 
-def claim(folder: str | os.PathLike, what: dict[str, Any]) -> None:
+def claim_folder(folder: str | os.PathLike, what: dict[str, Any]) -> None:
     """Write down what a run folder is for; raise `ValueError` where it holds a run of something else.
 
     A checkpoint of the right shapes would else be resumed with another seed, plan or dataset.
@@ -115,13 +115,13 @@ def claim(folder: str | os.PathLike, what: dict[str, Any]) -> None:
         if differs:
             raise ValueError(f"{folder} holds a run with another {', '.join(differs)}: name another folder")
         return
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text(json.dumps(what, indent=1) + "\n")
 
 
 def _truncate(path: Path, done: int) -> None:
     kept = [entry for entry in read(path.parent) if entry["step"] <= done]
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text("".join(json.dumps(entry) + "\n" for entry in kept), encoding="utf-8")
 
 

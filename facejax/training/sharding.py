@@ -20,24 +20,24 @@ Tree = Any
 AXIS = "data"
 
 
-def line(devices: Sequence[jax.Device] | None = None) -> Mesh:
+def data_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
     """A mesh of one axis, `data`; by default all devices of all processes."""
     return Mesh(np.array(jax.devices() if devices is None else devices), (AXIS,))
 
 
-def everywhere(mesh: Mesh) -> NamedSharding:
+def replicated(mesh: Mesh) -> NamedSharding:
     """The sharding of what every device holds whole."""
     return NamedSharding(mesh, PartitionSpec())
 
 
-def along(mesh: Mesh, axis: int = 0) -> NamedSharding:
+def split_along(mesh: Mesh, axis: int = 0) -> NamedSharding:
     """The sharding of arrays that are split along an axis, counted from the first."""
     if axis < 0:
         raise ValueError(f"axis: expected 0 or more, got {axis}")
     return NamedSharding(mesh, PartitionSpec(*(None,) * axis, AXIS))
 
 
-def put(tree: Tree, sharding: NamedSharding) -> Tree:
+def shard(tree: Tree, sharding: NamedSharding) -> Tree:
     """Arrays, which every process has whole, laid out over the devices of all processes; typed random keys too."""
 
     def one(leaf: Any) -> jax.Array:
@@ -49,7 +49,7 @@ def put(tree: Tree, sharding: NamedSharding) -> Tree:
     return jax.tree.map(one, tree)
 
 
-def take(tree: Tree) -> Tree:
+def unshard(tree: Tree) -> Tree:
     """Copies of whole arrays that belong to no device in particular, as new arrays do."""
 
     def one(leaf: jax.Array) -> jax.Array:
@@ -68,22 +68,22 @@ def data_parallel(step: Callable, *, axis: int = 0, mesh: Mesh | None = None) ->
     By default among all devices that there are. What comes back is to be jitted, as any `training.Step`. JAX's
     partitioner splits the work and sums the gradients: the step, its batch, its random numbers and so its
     results, but for the order of sums, are those of one device. On a CPU it is worth it where products are too small
-    for several cores: `runtime.every_core()`. Raises `ValueError` for a batch that cannot be shared out evenly.
+    for several cores: `runtime.use_all_cores()`. Raises `ValueError` for a batch that cannot be shared out evenly.
     """
-    mesh = line() if mesh is None else mesh
-    place = partial(jax.lax.with_sharding_constraint, shardings=everywhere(mesh))
+    mesh = data_mesh() if mesh is None else mesh
+    place = partial(jax.lax.with_sharding_constraint, shardings=replicated(mesh))
 
     def stepped(state: Tree, batch: Tree, constants: Tree) -> Tree:
-        check_shared(batch, mesh, axis)
+        check_divisible(batch, mesh, axis)
         batch = jax.tree.map(
-            lambda leaf: jax.lax.with_sharding_constraint(leaf, along(mesh, axis % jax.numpy.ndim(leaf))), batch
+            lambda leaf: jax.lax.with_sharding_constraint(leaf, split_along(mesh, axis % jax.numpy.ndim(leaf))), batch
         )
         return place(step(place(state), batch, place(constants)))
 
     return stepped
 
 
-def check_shared(batch: Tree, mesh: Mesh, axis: int) -> None:
+def check_divisible(batch: Tree, mesh: Mesh, axis: int) -> None:
     """Raise `ValueError` for arrays that cannot be shared out evenly along an axis."""
     for leaf in jax.tree.leaves(batch):
         shape = np.shape(leaf)
@@ -93,12 +93,12 @@ def check_shared(batch: Tree, mesh: Mesh, axis: int) -> None:
             raise ValueError(f"a batch of {what} cannot be shared out evenly among {mesh.size} devices")
 
 
-def is_first() -> bool:
+def is_primary() -> bool:
     """Whether this process is the one that writes what all of them have."""
     return jax.process_index() == 0
 
 
-def from_first(tree: Tree) -> Tree:
+def broadcast_from_primary(tree: Tree) -> Tree:
     """What the first process has, in all of them; trees of one structure, with typed random keys or without."""
     if jax.process_count() == 1:
         return tree
@@ -112,14 +112,14 @@ def from_first(tree: Tree) -> Tree:
     return jax.tree.map(like, tree, told)
 
 
-def most(number: int) -> int:
+def max_over_processes(number: int) -> int:
     """The largest of what the processes say."""
     if jax.process_count() == 1:
         return number
     return int(np.max(multihost_utils.process_allgather(np.int32(number))))
 
 
-def meet(name: str) -> None:
+def barrier(name: str) -> None:
     """Wait until all processes are here."""
     if jax.process_count() > 1:
         multihost_utils.sync_global_devices(name)

@@ -40,12 +40,12 @@ def supervised(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
     return step
 
 
-def start_supervised(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
+def init_supervised(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
     """The state that `supervised` starts from."""
     return TrainState(jnp.int32(0), params, optimiser.init(params), key)
 
 
-def averaged(step: Step, decay: float) -> Step:
+def with_moving_average(step: Step, decay: float) -> Step:
     """`step`, and in `extra` the exponential moving average of the parameters; let it start as the parameters."""
 
     def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
@@ -56,7 +56,7 @@ def averaged(step: Step, decay: float) -> Step:
     return stepped
 
 
-def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
+def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
     """One step of E models that know nothing of each other: parameters, optimiser states, batches stacked, (E, ...).
 
     `step` sees one of them, with constants (own, shared) of which `own` comes stacked too, and a key made of the run's
@@ -99,8 +99,8 @@ def side_by_side(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
     return stepped
 
 
-def start_side_by_side(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
-    """The state that `side_by_side` of `supervised` steps starts from; every leaf of `params` is stacked, (E, ...)."""
+def init_vectorized_models(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
+    """The state that `vectorize_models` of `supervised` steps starts from; every leaf of `params` is stacked, (E, ...)."""
     return TrainState(jnp.int32(0), params, jax.vmap(optimiser.init)(params), key)
 
 
@@ -170,7 +170,7 @@ def adversarial(
     return step
 
 
-def start_adversarial(params: Players, optimisers: Players, key: jax.Array) -> TrainState:
+def init_adversarial(params: Players, optimisers: Players, key: jax.Array) -> TrainState:
     """The state that `adversarial` starts from."""
     opt_state = Players(*(optimiser.init(side) for optimiser, side in zip(optimisers, params, strict=True)))
     return TrainState(jnp.int32(0), params, opt_state, key, extra=params.generator)

@@ -50,7 +50,7 @@ def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.nda
 
 def save(path: str | os.PathLike, pixels) -> None:
     """Write a picture (height, width, 3) uint8 as PNG, atomically."""
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         Image.fromarray(np.asarray(pixels, np.uint8)).save(temporary)
 
 

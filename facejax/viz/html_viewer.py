@@ -52,7 +52,7 @@ def write(
     film = scene.make(vertices, faces, fps=fps, captions=captions, landmarks=landmarks, extras=extras)
     page = string.Template(resources.files("facejax.viz").joinpath("viewer.html").read_text("utf-8"))
     text = page.substitute(_fields(film, str(title), colours))
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         temporary.write_text(text, "utf-8")
 
 
@@ -66,7 +66,7 @@ def _fields(film: scene.Scene, title: str, colours) -> dict[str, str]:
     surface = [np.column_stack([scene.colours(p), np.full(p.vertices.shape[-2], p.gloss)]) for p in parts]
     offsets = np.cumsum([0] + [layer.shape[1] for layer in layers])
     triangles = [part.faces + offset for part, offset in zip(parts, offsets, strict=False)]
-    shown = np.concatenate([*triangles, props.stopper(film.vertices[0], film.faces)])
+    shown = np.concatenate([*triangles, props.close_largest_hole(film.vertices[0], film.faces)])
     marks = 0
     if film.landmarks is not None:
         marks = film.landmarks.shape[1]
@@ -74,7 +74,7 @@ def _fields(film: scene.Scene, title: str, colours) -> dict[str, str]:
         surface.append(np.zeros((marks, 4)))
     points = np.concatenate(layers, 1)
     packed, origin, step = _quantise(points)
-    view = render.aim(film.vertices, size=_ASPECT, margin=0.03)
+    view = render.fit_camera(film.vertices, size=_ASPECT, margin=0.03)
     centre = (film.vertices.min((0, 1)) + film.vertices.max((0, 1))).astype(np.float64) / 2
     meta = {
         "frames": count,

@@ -49,7 +49,7 @@ def eyeball(
     return scene.Part(vertices.astype(np.float32), faces.astype(np.int32), colour.astype(np.float32), 1.0)
 
 
-def stopper(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def close_largest_hole(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Triangles (K, 3) that close the widest of several holes, so that no light shows through a mouth.
 
     The widest hole of a head is its neck. A mesh with fewer than two holes (a mask) is left open: no

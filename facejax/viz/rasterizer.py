@@ -27,7 +27,7 @@ class Hits(NamedTuple):
     inside: np.ndarray
 
 
-def cast(points: np.ndarray, nearness: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Hits:
+def rasterize(points: np.ndarray, nearness: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Hits:
     """Finds the nearest triangle of every sample, front and back faces alike.
 
     Args:

@@ -12,7 +12,7 @@ import numpy as np
 from facejax.viz import props, rasterizer, scene, shading
 from facejax.viz.contact_sheet import caption, contact_sheet, save
 
-__all__ = ["Camera", "aim", "caption", "contact_sheet", "frames", "heat", "image", "save"]
+__all__ = ["Camera", "caption", "contact_sheet", "fit_camera", "frames", "heat_colours", "image", "save"]
 
 SKIN_GLOSS = 0.30
 LANDMARK = (0.02, 0.55, 0.80)
@@ -31,7 +31,7 @@ class Camera(NamedTuple):
     zoom: float
 
 
-def aim(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, margin=0.05) -> Camera:
+def fit_camera(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, margin=0.05) -> Camera:
     """A camera that holds every given vertex, in all frames, in the picture.
 
     Args:
@@ -86,7 +86,7 @@ def frames(
       (T, height, width, 3) uint8.
     """
     film = scene.make(vertices, faces, landmarks=landmarks, extras=extras)
-    view = aim(film.vertices, size=size) if camera is None else camera
+    view = fit_camera(film.vertices, size=size) if camera is None else camera
     count, points = film.vertices.shape[:2]
     tint = np.asarray(scene.SKIN if colours is None else colours, np.float32)
     if tint.shape not in ((3,), (points, 3), (count, points, 3)):
@@ -94,7 +94,7 @@ def frames(
     tint = np.broadcast_to(shading.linear(tint), (count, points, 3))
     neighbours = shading.neighbours(film.faces, points)
     # The stopper is drawn but gives no normal: the rim of the neck keeps its own light.
-    solid = np.concatenate([film.faces, props.stopper(film.vertices[0], film.faces)])
+    solid = np.concatenate([film.faces, props.close_largest_hole(film.vertices[0], film.faces)])
     backdrop = _backdrop(background, size, samples)
     pictures = np.empty((count, size[1], size[0], 3), np.uint8)
     for t, surface in enumerate(film.vertices):
@@ -112,7 +112,7 @@ def image(vertices, faces, *, landmarks=None, **options) -> np.ndarray:
     return frames(np.asarray(vertices)[None], faces, landmarks=landmarks, **options)[0]
 
 
-def heat(values, *, low=0.0, high=None) -> np.ndarray:
+def heat_colours(values, *, low=0.0, high=None) -> np.ndarray:
     """Colours (..., 3) of values (...): pale, yellow, orange, dark red; high is the maximum if not given."""
     values = np.asarray(values, np.float64)
     high = float(values.max()) if high is None else high
@@ -151,7 +151,7 @@ def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples
     colours = np.concatenate([layer.colours for layer in layers])
 
     screen, nearness = _project(points, view, width, height)
-    hits = rasterizer.cast(screen, nearness, faces, (width, height))
+    hits = rasterizer.rasterize(screen, nearness, faces, (width, height))
     corner = faces.T[:, hits.face]
     # Perspective: attributes over depth are affine on the screen, and so is 1/depth itself.
     weight = hits.inside * nearness.astype(np.float32)[corner]
@@ -159,7 +159,7 @@ def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples
     weight /= near
     attribute = np.concatenate([normals, colours], 1).astype(np.float32)
     value = sum(weight[i, :, None] * np.take(attribute, corner[i], axis=0) for i in range(3))
-    light = shading.lit(value[:, :3], value[:, 3:], gloss[hits.face])
+    light = shading.shade(value[:, :3], value[:, 3:], gloss[hits.face])
     edge = screen[faces]
     ab, ac = edge[:, 1] - edge[:, 0], edge[:, 2] - edge[:, 0]
     behind = (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]) > 0

@@ -21,7 +21,7 @@ INSIDE = (0.028, 0.010, 0.009)
 _TABLE = 512
 
 
-def lit(normal: np.ndarray, colour: np.ndarray, gloss: np.ndarray) -> np.ndarray:
+def shade(normal: np.ndarray, colour: np.ndarray, gloss: np.ndarray) -> np.ndarray:
     """Linear light (S, 3) for camera-space normals (S, 3), linear colours (S, 3) and gloss (S,)."""
     length = np.sqrt(np.einsum("sa,sa->s", normal, normal))
     scale = (_TABLE / 2 - 1) / np.maximum(length, 1e-20)

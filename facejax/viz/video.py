@@ -34,13 +34,13 @@ def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
         raise ValueError(f"fps must be positive, got {fps}")
     suffix = check(path)
     if suffix == ".mp4":
-        with atomic.replacing(path) as temporary:
+        with atomic.replace_file(path) as temporary:
             _write_mp4(temporary, frames, fps, quality)
         return
     first, *rest = [Image.fromarray(frame) for frame in frames]
     durations = _durations(len(frames), fps, 10 if suffix == ".gif" else 1)
     options = {"quality": quality, "method": 4} if suffix == ".webp" else {"disposal": 1}
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         first.save(temporary, save_all=True, append_images=rest, duration=durations, loop=0, **options)
 
 

@@ -178,7 +178,7 @@ def test_own_meshes_become_a_dataset(capsys, tmp_path, capture):
     code, printed, err = run(capsys, "data", "prepare", "folder", *options, "--fps", 60)
     assert code == 0 and printed == f"{tmp_path / 'o' / 'own'}\n", err
     assert "read as metres" in err and "no neutral mesh" in err and "nobody serves validation and test" in err
-    data = dataset.open_store(tmp_path / "o" / "own")
+    data = dataset.open_dataset(tmp_path / "o" / "own")
     assert data.labels == ("neutral", "big_smile") and data.index["rate"] == 60
     assert [*data.index["notes"], "train: S1"] == err.splitlines()
     np.testing.assert_allclose(np.linalg.norm(data.vertices[4], axis=-1), 110, atol=1e-3)

@@ -61,7 +61,7 @@ def test_a_job_that_cannot_be_joined_is_refused_at_once(told, message, monkeypat
         if name in told:
             monkeypatch.setenv(variable, told[name])
     with pytest.raises(ValueError, match=message):
-        runtime.join()
+        runtime.join_distributed()
 
 
 def test_without_a_job_there_is_nothing_to_join():

@@ -100,5 +100,5 @@ def test_wrong_folds_and_splits_are_named(ball_store):
         train.folds(1)
     with pytest.raises(ValueError, match="2 or more folds and labels, got 3 and 1"):
         train.of_labels(["a"]).folds(3, by="labels")
-    with pytest.raises(dataset.StoreError, match="unknown split 'dev'"):
+    with pytest.raises(dataset.DatasetError, match="unknown split 'dev'"):
         of_split(ball_store, "train", "dev")

@@ -43,7 +43,7 @@ def recorded(subjects=3, labels=("neutral", "a", "b", "c"), *, bend=0.3, direct=
             sequences.append(dataset.Sequence(subject, name, begin, frames, *marks.tolist(), frames / RATE))
             rows.append(neutral[subject, index] + curve)
             begin += frames
-    return dataset.Store(
+    return dataset.Dataset(
         Path("made-up"),
         {"labels": list(labels), "rate": RATE, "subjects": [{"split": split}] * subjects},
         tuple(sequences),

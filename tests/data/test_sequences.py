@@ -107,13 +107,13 @@ def test_extending_holds_the_last_frame():
 
 def test_a_mirror_swaps_the_sides_and_changes_nothing_else():
     data = made([5, 7], landmarks=68)
-    other = sequences.mirrored(data)
+    other = sequences.mirror(data)
     mirror = schemes.by_count(68).mirror
     np.testing.assert_array_equal(other.curves[:, :, mirror], data.curves * [-1, 1, 1])
-    for a, b in zip(sequences.mirrored(other), data, strict=True):
+    for a, b in zip(sequences.mirror(other), data, strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="no scheme of 4 landmarks"):
-        sequences.mirrored(made([5]))
+        sequences.mirror(made([5]))
 
 
 def test_joined_recordings_have_the_longest_ones_room():

@@ -27,9 +27,9 @@ def quick():
 @pytest.fixture(scope="module")
 def options(template):
     return baselines.Options(
-        decoder=fit_s2d_dec.Plan(steps=1, batch=2),
-        residual=fit_residual.Plan(steps=1, batch=2),
-        neural3dmm=fit_neural3dmm.Plan(steps=1, batch=2),
+        decoder=fit_s2d_dec.S2DDecPlan(steps=1, batch=2),
+        residual=fit_residual.ResidualPlan(steps=1, batch=2),
+        neural3dmm=fit_neural3dmm.Neural3DMMPlan(steps=1, batch=2),
         components=8,
         hierarchy=hierarchy.build(template.vertices, template.faces, lengths=3),
     )
@@ -99,7 +99,7 @@ def test_others_are_their_models(fitted, options, new):
     params = dict(zip(("s2d", "gpmm", "dl3dmm"), map(fitted, ("s2d", "gpmm", "dl3dmm")), strict=True))
     expected = {
         "s2d": s2d_dec.apply(params["s2d"][0], options.hierarchy, marks),
-        "gpmm": linear.apply(gpmm.on_face(params["gpmm"].params, neutral), marks),
+        "gpmm": linear.apply(gpmm.linear_map(params["gpmm"].params, neutral), marks),
         "dl3dmm": linear.apply(params["dl3dmm"].params, marks),
     }
     for name, displacements in expected.items():

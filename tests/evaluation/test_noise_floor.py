@@ -17,19 +17,21 @@ def sample(frames, *, unseen, groups=4, seed=0):
 @pytest.mark.parametrize("unseen", [0.05, 0.3])
 def test_it_is_the_noise_that_nobody_can_predict(unseen):
     landmarks, meshes, group = sample(4_000, unseen=unseen)
-    found = noise_floor.estimate(meshes, *noise_floor.pairs(landmarks, group))
+    found = noise_floor.estimate(meshes, *noise_floor.nearest_pairs(landmarks, group))
     expected = unseen * np.linalg.norm(np.random.default_rng(1).normal(size=(100_000, 3)), axis=1).mean()
     np.testing.assert_allclose(found, expected, rtol=0.25)
 
 
 def test_without_noise_it_is_near_nothing():
     landmarks, meshes, group = sample(4_000, unseen=0.0)
-    assert noise_floor.estimate(meshes, *noise_floor.pairs(landmarks, group)).max() < 0.12 * np.abs(meshes).mean()
+    assert (
+        noise_floor.estimate(meshes, *noise_floor.nearest_pairs(landmarks, group)).max() < 0.12 * np.abs(meshes).mean()
+    )
 
 
 def test_pairs_are_the_nearest_of_other_groups():
     landmarks, _, group = sample(60, unseen=0.0)
-    both, squared = noise_floor.pairs(landmarks, group, count=3)
+    both, squared = noise_floor.nearest_pairs(landmarks, group, count=3)
     flat = landmarks.reshape(60, -1)
     for i in range(60):
         others = np.flatnonzero(group != group[i])
@@ -41,9 +43,9 @@ def test_pairs_are_the_nearest_of_other_groups():
 def test_pairs_within_a_group_are_of_other_recordings():
     landmarks, _, group = sample(80, unseen=0.0)
     recording = np.arange(80) // 10
-    both, _ = noise_floor.pairs(landmarks, group, apart=recording, alike=True)
+    both, _ = noise_floor.nearest_pairs(landmarks, group, apart=recording, alike=True)
     assert (group[both[:, 0]] == group[both[:, 1]]).all() and (recording[both[:, 0]] != recording[both[:, 1]]).all()
     with pytest.raises(ValueError, match="need `apart`"):
-        noise_floor.pairs(landmarks, group, alike=True)
+        noise_floor.nearest_pairs(landmarks, group, alike=True)
     with pytest.raises(ValueError, match="no two frames to compare"):
-        noise_floor.pairs(landmarks, np.zeros(80))
+        noise_floor.nearest_pairs(landmarks, np.zeros(80))

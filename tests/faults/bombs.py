@@ -135,7 +135,7 @@ def main() -> None:
     readers = {
         "mesh": (meshes.read, meshes.MeshError), "pickle": (safe_pickle.read, safe_pickle.PickleError),
         "livelink": (livelink.read, livelink.RecordingError), "landmarks": (landmarks.read, landmarks.LandmarkError),
-        "store": (lambda path: dataset.open_store(path.parent), dataset.StoreError),
+        "store": (lambda path: dataset.open_dataset(path.parent), dataset.DatasetError),
         "corpus": (lambda path: corpora.load(path.parent), corpora.CorpusError),
         "weights": (lambda path: weights.load(path, {}), weights.WeightsError),
     }  # fmt: skip

@@ -175,11 +175,13 @@ def readers() -> dict[str, Callable[[], Reader]]:
         index["subjects"] = [{"name": "A", "split": "train"}]
 
         def use(path: Path) -> object:
-            found = dataset.open_store(path)
+            found = dataset.open_dataset(path)
             return found.labels, found.people(), found.row_subjects(), found.row_labels(), found.meshes("train")
 
         whole = {f"{name}.npy": npy(array) for name, array in arrays.items()}
-        return Reader(".json", [json.dumps(index).encode()], in_folder("index.json", whole, use), (dataset.StoreError,))
+        return Reader(
+            ".json", [json.dumps(index).encode()], in_folder("index.json", whole, use), (dataset.DatasetError,)
+        )
 
     def corpus_index() -> Reader:
         data = npz(landmarks=np.zeros((2, 3, 5, 3), "f4"), labels=np.zeros((2, 2), "i4"), person=np.zeros(2, "i4"))

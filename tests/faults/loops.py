@@ -21,8 +21,8 @@ def motions():
     from tests.data.test_motions import recorded
 
     known = transitions.transitions(recorded(subjects=6), "train", per_pair=6)
-    chart = transitions.chart_of(known, labels=4, rank=8, pose=4)
-    return known, chart, transitions.examples_of(chart, [known])
+    chart = transitions.fit_chart(known, labels=4, rank=8, pose=4)
+    return known, chart, transitions.encode_examples(chart, [known])
 
 
 def gan(folder, mesh):
@@ -71,14 +71,14 @@ def decoder(folder, mesh):
     from facejax.training.recipes import fit_s2d_dec
 
     _, train, hierarchy = balls()
-    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.Plan(steps=STEPS, batch=8), mesh=mesh)
+    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=STEPS, batch=8), mesh=mesh)
 
 
 def residual(folder, mesh):
     from facejax.training.recipes import fit_gpmm, fit_residual
 
     _, train, hierarchy = balls()
-    base, plan = fit_gpmm.fit(train, components=20), fit_residual.Plan(steps=STEPS, batch=8)
+    base, plan = fit_gpmm.fit(train, components=20), fit_residual.ResidualPlan(steps=STEPS, batch=8)
     return fit_residual.fit(train, hierarchy, folder, plan=plan, base=base, mesh=mesh).network
 
 
@@ -86,7 +86,7 @@ def neural3dmm(folder, mesh):
     from facejax.training.recipes import fit_neural3dmm
 
     _, train, hierarchy = balls()
-    plan = fit_neural3dmm.Plan(steps=STEPS, batch=8)
+    plan = fit_neural3dmm.Neural3DMMPlan(steps=STEPS, batch=8)
     return fit_neural3dmm.fit(train, hierarchy, folder, plan=plan, mesh=mesh).params
 
 
@@ -128,7 +128,7 @@ def main() -> None:
 
     jax.config.update("jax_num_cpu_devices", given.devices)
     if given.distributed:
-        runtime.join(patience=10)
+        runtime.join_distributed(patience=10)
     runtime.compile_cache()
     several = given.distributed or given.devices > 1
     if given.plain:
@@ -146,7 +146,7 @@ def main() -> None:
         return run(step, state, slow, folder, **options | often)
 
     loop.run = frequent
-    leaves = jax.tree.leaves(LOOPS[given.loop](given.folder, sharding.line() if several else None))
+    leaves = jax.tree.leaves(LOOPS[given.loop](given.folder, sharding.data_mesh() if several else None))
     found = hashlib.sha256()
     for leaf in leaves:
         found.update(np.ascontiguousarray(leaf).tobytes())

@@ -110,7 +110,7 @@ def test_the_transform(dtype):
     off = np.abs(np.asarray(back, np.float64) - np.asarray(curve, np.float64)).max(axis=(1, 2, 3)) / extent
     assert off[~still].max() < 64 * eps
     finite(srvf.displacement, q, log_length)
-    share = np.asarray(finite(srvf.covered, q))
+    share = np.asarray(finite(srvf.arc_length_fraction, q))
     assert (np.diff(share) >= 0).all() and set(share[:, 0]) == {0.0} and set(share[~still, -1]) == {1.0}
     finite(srvf.length, curve)
 

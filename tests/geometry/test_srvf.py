@@ -130,23 +130,27 @@ def test_standstill(double, size):
 
 def test_covered_against_a_loop_and_from_zero_to_one_exactly(x64):
     q = curves(14, 3, frames=5)
-    for one, share in zip(q, srvf.covered(q), strict=True):
+    for one, share in zip(q, srvf.arc_length_fraction(q), strict=True):
         speeds = [np.sum(step**2) for step in one]
         np.testing.assert_allclose(share, [sum(speeds[:t]) / sum(speeds) for t in range(6)], atol=1e-14)
-    single = srvf.covered(jnp.asarray(curves(15, 500, frames=29), jnp.float32))
+    single = srvf.arc_length_fraction(jnp.asarray(curves(15, 500, frames=29), jnp.float32))
     np.testing.assert_array_equal(single[:, 0], 0)
     np.testing.assert_array_equal(single[:, -1], 1)
-    np.testing.assert_array_equal(srvf.covered(jnp.zeros((5, 4, 3))), 0)
-    check_grads(lambda q: jnp.sum(curves(16, frames=1)[0, 0, 0] * srvf.covered(q) ** 2), (jnp.asarray(q),), **GRADIENT)
+    np.testing.assert_array_equal(srvf.arc_length_fraction(jnp.zeros((5, 4, 3))), 0)
+    check_grads(
+        lambda q: jnp.sum(curves(16, frames=1)[0, 0, 0] * srvf.arc_length_fraction(q) ** 2),
+        (jnp.asarray(q),),
+        **GRADIENT,
+    )
 
 
 def test_covered_is_the_share_of_the_path_in_the_curve(x64):
     curve = jnp.asarray(curves(17))
     q, _ = srvf.encode(curve)
     lengths = [srvf.length(curve[: t + 1]) for t in range(1, 6)]
-    np.testing.assert_allclose(srvf.covered(q)[1:], np.array(lengths) / lengths[-1], atol=1e-13)
+    np.testing.assert_allclose(srvf.arc_length_fraction(q)[1:], np.array(lengths) / lengths[-1], atol=1e-13)
     even = jnp.concatenate([q[:1], q[:1], q[:1]])
-    np.testing.assert_allclose(srvf.covered(even), np.linspace(0, 1, 4), atol=1e-14)
+    np.testing.assert_allclose(srvf.arc_length_fraction(even), np.linspace(0, 1, 4), atol=1e-14)
 
 
 def encode_loss(curve, seed=7):
@@ -204,7 +208,7 @@ def test_gradient_of_a_pause_is_finite_and_that_of_the_pause_itself_zero(double)
         (lambda: srvf.decode(jnp.ones((6, 4, 3)), 0.0, jnp.ones((5, 3))), r"start.*L = 4.*\(5, 3\)"),
         (lambda: srvf.decode(jnp.ones((6, 4)), 0.0, jnp.ones((4, 3))), "q: expected"),
         (lambda: srvf.length(jnp.ones((4, 3))), "curve: expected"),
-        (lambda: srvf.covered(jnp.ones((4, 3))), "q: expected"),
+        (lambda: srvf.arc_length_fraction(jnp.ones((4, 3))), "q: expected"),
     ],
 )
 def test_wrong_input_is_named(call, match):

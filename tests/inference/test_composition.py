@@ -20,7 +20,7 @@ from tests.models.motion.test_motion3dgan import CONFIG, SHAPE, fitted, plain_we
 
 DRAWN = 6
 CHAIN = [0, 1, 2, 0, 2, 1] + [2, 1] * 6 + [0, 1, 0]  # twenty transitions
-KEYS = composition.keys_of(jax.random.key(1), 3)
+KEYS = composition.sample_keys(jax.random.key(1), 3)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_frames_between_lie_on_cubics():
 
 @pytest.fixture(scope="module", params=["gan", "flow"])
 def drawn(request, made, beginnings):
-    return composition.draw(made[request.param], beginnings, KEYS, composition.pairs_of(CHAIN))
+    return composition.draw(made[request.param], beginnings, KEYS, composition.label_pairs(CHAIN))
 
 
 def test_chains_start_at_neutral_meet_and_come_home_exactly(drawn):
@@ -165,7 +165,7 @@ def test_twenty_transitions_do_not_drift(drawn):
 
 
 def test_samples_do_not_depend_on_how_many_there_are_and_compose_joins_them(made, beginnings):
-    pairs, key = composition.pairs_of(CHAIN), jax.random.key(1)
+    pairs, key = composition.label_pairs(CHAIN), jax.random.key(1)
     many, few = (composition.draw(made["gan"], beginnings, KEYS[:count], pairs) for count in (3, 1))
     np.testing.assert_allclose(few.curves[0], many.curves[0], atol=1e-5)
     whole = composition.compose(made["gan"], beginnings, key, CHAIN, samples=3)
@@ -181,14 +181,14 @@ def test_samples_do_not_depend_on_how_many_there_are_and_compose_joins_them(made
 
 def loop_chain(params, beginnings, key, labels):
     """Transition by transition: where the face stands, what the generator is told, and what of its answer is kept."""
-    chart, heeds = params.chart, not isinstance(params, motion3dgan_reference.Params)
+    chart, heeds = params.chart, not isinstance(params, motion3dgan_reference.Motion3DGANReference)
     first_key, key = jax.random.split(key)
     pose = start_poses.sample(beginnings, first_key, labels[0]) if heeds else jnp.zeros(CONFIG.pose)
-    here, curves = np.asarray(tangent_pca.unpose(chart, pose, labels[0])), []
+    here, curves = np.asarray(tangent_pca.decode_pose(chart, pose, labels[0])), []
     for one, start, end in zip(jax.random.split(key, len(labels) - 1), labels, labels[1:], strict=False):
-        pose = start_poses.plausible(beginnings, tangent_pca.pose(chart, here, start), start)
+        pose = start_poses.clip_to_distribution(beginnings, tangent_pca.encode_pose(chart, here, start), start)
         made = generators.sample(params, one, start, end, pose)
-        meant = np.asarray(tangent_pca.unpose(chart, pose, start)) if heeds else here
+        meant = np.asarray(tangent_pca.decode_pose(chart, pose, start)) if heeds else here
         curve, covered = [meant], [0.0]
         for step in np.asarray(made.q):
             speed = np.linalg.norm(step)
@@ -207,7 +207,7 @@ def loop_chain(params, beginnings, key, labels):
 def test_a_chain_is_the_plain_loop(made, beginnings, name):
     """The authors' generator starts at the mean peak and goes on from where it stands: its errors add up."""
     labels = [1, 2, 0, *CHAIN[1:-2]]
-    curves = composition.draw(made[name], beginnings, KEYS, composition.pairs_of(labels)).curves
+    curves = composition.draw(made[name], beginnings, KEYS, composition.label_pairs(labels)).curves
     np.testing.assert_allclose(curves[1], loop_chain(made[name], beginnings, KEYS[1], labels), atol=1e-4)
     home = np.linalg.norm(curves[:, 1, -1], axis=(-2, -1))
     if name == "gan":
@@ -220,14 +220,14 @@ def test_a_chain_is_the_plain_loop(made, beginnings, name):
 
 def test_implausible_poses_are_brought_back(beginnings):
     far = 50 * jnp.ones(CONFIG.pose)
-    near = start_poses.plausible(beginnings, far, 1)
+    near = start_poses.clip_to_distribution(beginnings, far, 1)
     own = np.asarray(beginnings.poses[1])
     deviation = np.sqrt(np.linalg.eigvalsh(np.cov(own.T, bias=True)).sum())
     assert np.linalg.norm(near - own.mean(axis=0)) <= start_poses.LIMIT * deviation * 1.001
-    np.testing.assert_allclose(start_poses.plausible(beginnings, near, 1), near, atol=1e-4)
+    np.testing.assert_allclose(start_poses.clip_to_distribution(beginnings, near, 1), near, atol=1e-4)
     inside = start_poses.sample(beginnings, jax.random.key(0), 1) * 0.3
-    np.testing.assert_allclose(start_poses.plausible(beginnings, inside, 1), inside, atol=1e-4)
-    np.testing.assert_array_equal(start_poses.plausible(beginnings, far, 0), 0)
+    np.testing.assert_allclose(start_poses.clip_to_distribution(beginnings, inside, 1), inside, atol=1e-4)
+    np.testing.assert_array_equal(start_poses.clip_to_distribution(beginnings, far, 0), 0)
 
 
 def test_long_chains_of_the_released_generator_stay_finite_and_strong():
@@ -259,12 +259,12 @@ def test_compose_knows_its_labels_and_one_length_serves_all(made, beginnings):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: composition.pairs_of([1]), "a start and an end"),
-        (lambda: composition.pairs_of([0, 1, 1]), "number 3 repeats the one before"),
-        (lambda: composition.pairs_of(["neutral", "anger"]), "expected numbers.*pipeline.label_indices"),
-        (lambda: composition.pairs_of([0, -1]), "number 2 is -1, expected one from 0$"),
-        (lambda: composition.pairs_of([0, 3], classes=3), "number 2 is 3, expected one from 0 to 2"),
-        (lambda: composition.keys_of(jax.random.key(0), 0), "samples must be 1 or more"),
+        (lambda: composition.label_pairs([1]), "a start and an end"),
+        (lambda: composition.label_pairs([0, 1, 1]), "number 3 repeats the one before"),
+        (lambda: composition.label_pairs(["neutral", "anger"]), "expected numbers.*pipeline.label_indices"),
+        (lambda: composition.label_pairs([0, -1]), "number 2 is -1, expected one from 0$"),
+        (lambda: composition.label_pairs([0, 3], classes=3), "number 2 is 3, expected one from 0 to 2"),
+        (lambda: composition.sample_keys(jax.random.key(0), 0), "samples must be 1 or more"),
         (lambda: composition.timeline([30, 1]), r"2 or more for each transition, got \[30, 1\]"),
         (lambda: composition.join(random_curves(2), jnp.eye(6)), r"expected \(F, 12\) for 2 x 6 frames"),
     ],

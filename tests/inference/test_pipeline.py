@@ -79,7 +79,7 @@ def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):
     path = tmp_path / "s2d.safetensors"
     pipeline.save(path, models._replace(decoder=params))
     again = pipeline.load(path)
-    assert again.about["decoder"] == bundle.S2D and isinstance(again.decoder, s2d_dec.Params)
+    assert again.about["decoder"] == bundle.S2D and isinstance(again.decoder, s2d_dec.S2DDec)
     marks = pipeline.landmarks(again, KEY, ["neutral", "anger"], person.vertices, frames=3)
     moved = marks - pipeline.neutral_landmarks(again, person.vertices)
     expected = person.vertices + np.asarray(s2d_dec.apply(params, models.hierarchy, moved))

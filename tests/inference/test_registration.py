@@ -49,7 +49,9 @@ def test_the_template_comes_to_lie_on_the_head(head, which):
     turn, move = Rotation.from_rotvec([0.4, 2.0, -0.5]).as_matrix(), np.array([100.0, -50, 30])
     found = scans.fit(scan_of(head, list(which), turn=turn, move=move))
     placed, template = (found.vertices - move) @ turn, makehuman.template()
-    off = closest_point.query(closest_point.surface(head[0], template.faces), placed).distance[template.face_mask]
+    off = closest_point.closest_points(closest_point.surface(head[0], template.faces), placed).distance[
+        template.face_mask
+    ]
     apart = np.linalg.norm(placed - head[0], axis=1)[template.face_mask]
     assert off.mean() < 0.3 and apart.mean() < 1.5 and found.matched.mean() > 0.9
     # The way into the template's frame is the one that the vertices were moved by.
@@ -68,15 +70,15 @@ def test_a_motion_is_carried_to_the_scan(head):
     true, vertices, faces = head
     template = makehuman.template()
     found = scans.fit(scan_of(head, range(68)))
-    hung = inference_registration.carrier(found.vertices, template.faces, vertices, faces)
+    hung = inference_registration.bind(found.vertices, template.faces, vertices, faces)
     # A smooth motion that is known everywhere.
     field = lambda x: 3 * np.sin(x / 40) @ np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])  # noqa: E731
-    carried = inference_registration.carry(hung, np.stack([field(true), 2 * field(true)]))
+    carried = inference_registration.transfer_displacements(hung, np.stack([field(true), 2 * field(true)]))
     assert carried.shape == (2, len(vertices), 3)
     np.testing.assert_allclose(carried[1], 2 * carried[0], atol=1e-5)
     assert np.linalg.norm(carried[0] - field(vertices), axis=1).mean() < 0.2
     # What is far from the template stays where it is.
-    far = inference_registration.carrier(found.vertices, template.faces, vertices + [0, 0, 500.0], faces)
+    far = inference_registration.bind(found.vertices, template.faces, vertices + [0, 0, 500.0], faces)
     assert not far.weights.any()
 
 
@@ -84,7 +86,7 @@ def test_shape_is_a_principal_component_analysis():
     rng = np.random.default_rng(0)
     rest = makehuman.template()
     people = rest.vertices + rng.normal(size=(5, 1, 1)) * rng.normal(size=rest.vertices.shape)
-    found = inference_registration.shape(people, rest.faces, rest.landmarks, components=3)
+    found = inference_registration.fit_head_model(people, rest.faces, rest.landmarks, components=3)
     assert found.components.shape == (3, *rest.vertices.shape)
     flat = found.components.reshape(3, -1)
     gram = flat @ flat.T
@@ -182,11 +184,11 @@ def test_what_there_is_to_say_of_a_fit(head):
     true, vertices, faces = head
     front = faces[vertices[faces].mean(axis=1)[:, 2] > np.quantile(vertices[:, 2], 0.6)]
     half = scan_of((true, vertices, front), registration.SEVEN)
-    said = scans.remarks(scans.measured(half, scans.fit(half)))
+    said = scans.describe(scans.measure(half, scans.fit(half)))
     assert "the rest of the head is a guess: the scan has no surface there" in said
     off = scan_of(head, registration.SEVEN)
     off = off._replace(landmarks=off.landmarks + np.where(np.arange(7) % 2, 1, -1)[:, None] * [0, 0, 8.0])
-    assert any("are they of this face?" in note for note in scans.wear(off)[1])
+    assert any("are they of this face?" in note for note in scans.bind_scan(off)[1])
 
 
 def test_the_experiment(tmp_path):

@@ -36,17 +36,17 @@ def turned(angle):
 def test_landmarks_go_where_they_are_sent_and_the_neck_stays(head, curve):
     vertices, faces, marks, template = head
     face = retarget.prepare(vertices, faces, marks, template)
-    moved = np.asarray(retarget.move(face, curve))
+    moved = np.asarray(retarget.animate(face, curve))
     index = makehuman.template().landmarks
     norm = np.linalg.norm(marks - marks.mean(axis=0))
     # The person's landmarks are turned a little against the template's: the motion goes with them.
     np.testing.assert_allclose(np.linalg.norm(moved[-1, index] - vertices[index], axis=1).max(), 0.03 * norm, rtol=1e-3)
     np.testing.assert_allclose(moved[:, index], retarget.landmarks_of(face, curve), atol=1e-3)
     np.testing.assert_allclose(moved[0], vertices, atol=1e-4)
-    neck = rbf_weights.rim(vertices, faces, marks)
+    neck = rbf_weights.distant_boundary(vertices, faces, marks)
     assert np.abs(moved[-1, neck] - vertices[neck]).max() < 1e-4 and not face.notes
     loose = retarget.prepare(vertices, faces, marks, template, pin=False)
-    assert np.abs(np.asarray(retarget.move(loose, curve))[-1, neck] - vertices[neck]).max() > 0.1
+    assert np.abs(np.asarray(retarget.animate(loose, curve))[-1, neck] - vertices[neck]).max() > 0.1
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.1, 0.001])
@@ -57,7 +57,7 @@ def test_pose_and_unit_of_the_file_do_not_matter(head, curve, unit, angle):
     plain = retarget.prepare(vertices, faces, marks, template)
     turn = turned(angle)
     other = retarget.prepare(vertices @ turn.T * unit + 7 * unit, faces, marks @ turn.T * unit + 7 * unit, template)
-    a, b = (np.asarray(retarget.move(f, curve)) - f.vertices for f in (plain, other))
+    a, b = (np.asarray(retarget.animate(f, curve)) - f.vertices for f in (plain, other))
     # The pose that is left after the axes were put in order.
     rest = plain.rotation.T @ other.rotation
     np.testing.assert_allclose(b, a @ (other.rotation @ plain.rotation.T).T, atol=5e-3)
@@ -80,7 +80,7 @@ def test_another_topology_moves_like_the_first(head, curve):
     shuffled = np.random.default_rng(0).permutation(len(finer.vertices))
     where = np.argsort(shuffled)
     other = retarget.prepare(np.asarray(finer.vertices)[shuffled], where[finer.faces], marks, template)
-    a, b = (np.asarray(retarget.move(f, curve)) for f in (plain, other))
+    a, b = (np.asarray(retarget.animate(f, curve)) for f in (plain, other))
     off = np.abs(b[:, where[: len(vertices)]] - a)
     # Ways along edges are a little shorter on the finer mesh, so the lips part a little elsewhere at their corners.
     assert np.quantile(off, 0.98) < 0.02 and off.max() < 1
@@ -95,7 +95,7 @@ def test_other_landmark_schemes(head, curve, count):
     given[theirs] = marks[ours]
     face = retarget.prepare(vertices, faces, given, template)
     assert any(f"{len(ours)} of the motion's 68" in note for note in face.notes)
-    moved = np.asarray(retarget.move(face, curve))
+    moved = np.asarray(retarget.animate(face, curve))
     index = makehuman.template().landmarks[ours]
     np.testing.assert_allclose(moved[:, index], retarget.landmarks_of(face, curve), atol=1e-3)
     assert retarget.landmarks_of(face, curve).shape == (5, len(ours), 3)
@@ -104,11 +104,11 @@ def test_other_landmark_schemes(head, curve, count):
 def test_intensity_scales_and_batches_are_free(head, curve):
     vertices, faces, marks, template = head
     face = retarget.prepare(vertices, faces, marks, template, kernel="thin_plate")
-    once, twice = (np.asarray(retarget.move(face, curve, intensity=i)) - face.vertices for i in (1.0, 2.0))
+    once, twice = (np.asarray(retarget.animate(face, curve, intensity=i)) - face.vertices for i in (1.0, 2.0))
     np.testing.assert_allclose(twice, 2 * once, atol=1e-3)
-    both = retarget.move(face, np.stack([curve, 0 * curve]))
+    both = retarget.animate(face, np.stack([curve, 0 * curve]))
     np.testing.assert_allclose(both[0] - face.vertices, once, atol=1e-4)
-    slope = jax.grad(lambda c: retarget.move(face, c).sum())(jax.numpy.asarray(curve))
+    slope = jax.grad(lambda c: retarget.animate(face, c).sum())(jax.numpy.asarray(curve))
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
@@ -132,9 +132,9 @@ def test_landmarks_that_are_no_face(head, curve):
         retarget.prepare(vertices, faces, marks, template, kernel="cubic")
     face = retarget.prepare(vertices, faces, marks, template)
     with pytest.raises(ValueError, match=r"curve: expected \(..., T, L, 3\) with L of 68 or more"):
-        retarget.move(face, curve[:, :51])
+        retarget.animate(face, curve[:, :51])
     with pytest.raises(ValueError, match="intensity"):
-        retarget.move(face, curve, intensity=3)
+        retarget.animate(face, curve, intensity=3)
 
 
 def test_a_head_that_turns_takes_its_neck_along(head, curve):
@@ -146,6 +146,6 @@ def test_a_head_that_turns_takes_its_neck_along(head, curve):
     nods = np.stack([[[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]] for a in angles])
     nodding = np.einsum("tij,tlj->tli", nods, still) + 3 * angles[:, None, None]
     unitless = (nodding - marks) @ face.rotation / face.size
-    moved = np.asarray(retarget.move(face, unitless, head=True))
-    wanted = np.einsum("tij,tlj->tli", nods, np.asarray(retarget.move(face, curve))) + 3 * angles[:, None, None]
+    moved = np.asarray(retarget.animate(face, unitless, head=True))
+    wanted = np.einsum("tij,tlj->tli", nods, np.asarray(retarget.animate(face, curve))) + 3 * angles[:, None, None]
     np.testing.assert_allclose(moved, wanted, atol=2e-2)

@@ -7,23 +7,23 @@ from facejax.io import atomic
 
 def test_replacing_leaves_nothing_behind(tmp_path):
     target = tmp_path / "a" / "file.txt"
-    with pytest.raises(RuntimeError), atomic.replacing(target) as temporary:
+    with pytest.raises(RuntimeError), atomic.replace_file(target) as temporary:
         temporary.write_text("half")
         raise RuntimeError
     assert list(target.parent.iterdir()) == []
-    with atomic.replacing(target) as temporary:
+    with atomic.replace_file(target) as temporary:
         temporary.write_text("whole")
     assert target.read_text() == "whole" and len(list(target.parent.iterdir())) == 1
 
 
 def test_replacing_folder_replaces_or_vanishes(tmp_path):
     target = tmp_path / "folder"
-    with pytest.raises(RuntimeError), atomic.replacing_folder(target) as temporary:
+    with pytest.raises(RuntimeError), atomic.replace_folder(target) as temporary:
         (temporary / "x").write_text("half")
         raise RuntimeError
     assert list(tmp_path.iterdir()) == []
     for text in ("first", "second"):
-        with atomic.replacing_folder(target) as temporary:
+        with atomic.replace_folder(target) as temporary:
             (temporary / "x").write_text(text)
         assert (target / "x").read_text() == text
 
@@ -31,5 +31,5 @@ def test_replacing_folder_replaces_or_vanishes(tmp_path):
 def test_what_is_said_of_a_file_is_one_short_printable_line():
     said = str(atomic.FileError("/a b.ply: names\n\x1b[31mred\u202e\tand " + 9_000_000 * "x" + ": leave it out"))
     assert said.startswith("/a b.ply: names [31mred and xxx") and said.endswith("xxx: leave it out")
-    assert said.isprintable() and len(said) <= atomic.SAID + 5
+    assert said.isprintable() and len(said) <= atomic.MAX_MESSAGE_CHARS + 5
     assert atomic.one_line(ValueError("ä short one")) == "ä short one"

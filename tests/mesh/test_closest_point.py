@@ -13,7 +13,7 @@ VERTICES, FACES = np.asarray(BALL.vertices), np.asarray(BALL.faces)
 def test_the_nearest_point_of_all_triangles_is_found():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(200, 3))
-    hits = closest_point.query(closest_point.surface(VERTICES, FACES), points)
+    hits = closest_point.closest_points(closest_point.surface(VERTICES, FACES), points)
     triangles = VERTICES[FACES]
     for point, distance, found in zip(points, hits.distance, hits.points, strict=True):
         everywhere = trimesh.triangles.closest_point(triangles, np.repeat(point[None], len(FACES), axis=0))
@@ -28,7 +28,7 @@ def test_large_triangles_are_found_from_afar():
     square = np.array([[0, 0, 0], [100, 0, 0], [100, 100, 0], [0, 100, 0], [50, 50, -40.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 4, 1]])
     points = np.column_stack([np.random.default_rng(1).uniform(5, 95, size=(100, 2)), np.full(100, 3.0)])
-    hits = closest_point.query(closest_point.surface(square, faces), points)
+    hits = closest_point.closest_points(closest_point.surface(square, faces), points)
     np.testing.assert_allclose(hits.distance, 3.0, atol=1e-9)
 
 
@@ -41,16 +41,16 @@ def test_normals_tell_two_sheets_apart(size):
     faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]])
     on = closest_point.surface(vertices, faces)
     points = np.array([[0.3 * size, 0.2 * size, z] for z in (0.4, 0.6)])
-    assert closest_point.query(on, points).points[:, 2].tolist() == [0, 1]
+    assert closest_point.closest_points(on, points).points[:, 2].tolist() == [0, 1]
     up, down = np.array([[0, 0, 1.0]] * 2), np.array([[0, 0, -1.0]] * 2)
-    assert closest_point.query(on, points, normals=up, turn=1.0).points[:, 2].tolist() == [1, 1]
-    assert closest_point.query(on, points, normals=down, turn=1.0).points[:, 2].tolist() == [0, 0]
+    assert closest_point.closest_points(on, points, normals=up, turn=1.0).points[:, 2].tolist() == [1, 1]
+    assert closest_point.closest_points(on, points, normals=down, turn=1.0).points[:, 2].tolist() == [0, 0]
 
 
 def test_the_far_side_of_a_hole_is_its_edge():
     kept = FACES[VERTICES[FACES].mean(axis=1)[:, 2] < 0.8]
     on = closest_point.surface(VERTICES, kept)
-    hits = closest_point.query(on, np.array([[0, 0, 1.0], [0, 0, -1.0]]))
+    hits = closest_point.closest_points(on, np.array([[0, 0, 1.0], [0, 0, -1.0]]))
     assert closest_point.on_edge(on, hits).tolist() == [True, False]
     loops = np.concatenate(graph.boundary_loops(kept))
     assert (

@@ -44,7 +44,7 @@ def slope(vertices, corners, values):
 
 def test_gradients_and_areas_are_those_of_the_plain_loop():
     vertices, values = face(0), field(1, N)
-    operator, areas = deformation_transfer.gradient(vertices, FACES)
+    operator, areas = deformation_transfer.gradient_operator(vertices, FACES)
     expected = [slope(vertices, corners, values[corners]) for corners in FACES]
     np.testing.assert_allclose((operator @ values).reshape(-1, 3), expected, atol=1e-9)
     np.testing.assert_allclose(areas, trimesh.Trimesh(vertices, FACES, process=False).area_faces, rtol=1e-9)
@@ -53,7 +53,7 @@ def test_gradients_and_areas_are_those_of_the_plain_loop():
 def test_carried_fields_solve_the_stated_least_squares():
     source, target, fields = face(0), face(1), smooth(2, 3)
     motion = np.random.default_rng(3).uniform(0, 0.2, N)
-    found = deformation_transfer.Carrier(source, target, FACES, motion)(fields)
+    found = deformation_transfer.DeformationTransfer(source, target, FACES, motion)(fields)
     areas = trimesh.Trimesh(target, FACES, process=False).area_faces
     held = np.sqrt(deformation_transfer.HOLD * areas.mean() / (1 + (motion / deformation_transfer.STILL) ** 2))
     rows, wanted = [], []
@@ -75,13 +75,15 @@ def test_carried_fields_solve_the_stated_least_squares():
 @pytest.mark.parametrize("motion", [np.zeros(N), MOVING, np.linspace(0, 3, N)], ids=["still", "moving", "mixed"])
 def test_to_the_same_face_nothing_changes(motion):
     fields = field(1, 4, N, 3)
-    np.testing.assert_allclose(deformation_transfer.Carrier(face(0), face(0), FACES, motion)(fields), fields, atol=1e-6)
+    np.testing.assert_allclose(
+        deformation_transfer.DeformationTransfer(face(0), face(0), FACES, motion)(fields), fields, atol=1e-6
+    )
 
 
 def test_translations_are_carried_as_they_are():
     fields = np.broadcast_to(field(1, 2, 1, 3), (2, N, 3))
     np.testing.assert_allclose(
-        deformation_transfer.Carrier(face(0), face(1), FACES, np.ones(N))(fields), fields, atol=1e-6
+        deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N))(fields), fields, atol=1e-6
     )
 
 
@@ -89,7 +91,9 @@ def test_an_affine_field_of_a_flat_patch_stays_affine():
     (source, faces), (target, _) = grid(0), grid(1)
     assert np.abs(source - target).max() > 0.2
     matrix = field(2, 3, 3)
-    found = deformation_transfer.Carrier(source, target, faces, np.full(len(source), 10.0))((source @ matrix)[None])[0]
+    found = deformation_transfer.DeformationTransfer(source, target, faces, np.full(len(source), 10.0))(
+        (source @ matrix)[None]
+    )[0]
     # Where the whole lies gradients do not say; what the vertices are held to does: their mean stays.
     expected = target @ matrix
     np.testing.assert_allclose(found, expected - expected.mean(axis=0) + (source @ matrix).mean(axis=0), atol=1e-5)
@@ -97,7 +101,7 @@ def test_an_affine_field_of_a_flat_patch_stays_affine():
 
 def test_a_scaled_face_moves_scaled():
     fields = smooth(1, 2)
-    found = deformation_transfer.Carrier(face(0), 3 * face(0), FACES, MOVING)(fields)
+    found = deformation_transfer.DeformationTransfer(face(0), 3 * face(0), FACES, MOVING)(fields)
     shift = (found - 3 * fields).mean(axis=1, keepdims=True)
     np.testing.assert_allclose(found - shift, 3 * fields, atol=1e-4)
 
@@ -105,13 +109,13 @@ def test_a_scaled_face_moves_scaled():
 def test_turned_faces_turn_what_is_carried():
     turn = np.linalg.qr(field(9, 3, 3))[0]
     fields, motion = smooth(1, 2), np.linspace(0, 2, N)
-    plain = deformation_transfer.Carrier(face(0), face(1), FACES, motion)(fields)
-    turned = deformation_transfer.Carrier(face(0) @ turn, face(1) @ turn, FACES, motion)(fields @ turn)
+    plain = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, motion)(fields)
+    turned = deformation_transfer.DeformationTransfer(face(0) @ turn, face(1) @ turn, FACES, motion)(fields @ turn)
     np.testing.assert_allclose(turned, plain @ turn, atol=1e-7)
 
 
 def test_fields_are_carried_each_for_itself_and_linearly():
-    carrier, fields = deformation_transfer.Carrier(face(0), face(1), FACES, np.ones(N)), smooth(1, 3)
+    carrier, fields = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N)), smooth(1, 3)
     together = carrier(fields)
     assert together.shape == fields.shape
     for one, expected in zip(fields, together, strict=True):
@@ -122,30 +126,30 @@ def test_fields_are_carried_each_for_itself_and_linearly():
 def test_vertices_that_never_move_are_held():
     lower = np.asarray(BALL.vertices)[:, 2] < -0.3
     fields = np.where(lower[:, None], 0.0, smooth(1, 3))
-    held = deformation_transfer.Carrier(face(0), face(1), FACES, np.where(lower, 0.0, 10.0))(fields)
-    free = deformation_transfer.Carrier(face(0), face(1), FACES, MOVING)(fields)
+    held = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.where(lower, 0.0, 10.0))(fields)
+    free = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, MOVING)(fields)
     # The gradients leave open where the whole lies: so that what was still stays where it was.
     held, free = (np.linalg.norm(carried[:, lower].mean(axis=1), axis=-1) for carried in (held, free))
     assert (held < 1e-4).all() and (free > 1e-2).all()
 
 
 def test_settled_fields_come_back():
-    there = deformation_transfer.Carrier(face(0), face(1), FACES, np.ones(N))
-    back = deformation_transfer.Carrier(face(1), face(0), FACES, np.ones(N))
+    there = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N))
+    back = deformation_transfer.DeformationTransfer(face(1), face(0), FACES, np.ones(N))
     fields = smooth(1, 3)
     missing = [
-        np.linalg.norm(back(deformation_transfer.settle(there, back, fields, rounds=rounds)) - fields, axis=-1).mean()
+        np.linalg.norm(back(deformation_transfer.invert(there, back, fields, rounds=rounds)) - fields, axis=-1).mean()
         for rounds in (0, 1, 2, 4)
     ]
     assert missing[0] > 2 * missing[1] > 2 * missing[2] > 2 * missing[3] > 0
-    np.testing.assert_array_equal(deformation_transfer.settle(there, back, fields, rounds=0), there(fields))
+    np.testing.assert_array_equal(deformation_transfer.invert(there, back, fields, rounds=0), there(fields))
     np.testing.assert_array_equal(
-        deformation_transfer.settle(there, back, fields), deformation_transfer.settle(there, back, fields, rounds=2)
+        deformation_transfer.invert(there, back, fields), deformation_transfer.invert(there, back, fields, rounds=2)
     )  # fmt: skip
 
 
 def test_faces_of_different_shapes_are_named():
     with pytest.raises(ValueError, match=r"two faces of one shape .* got \(162, 3\), \(161, 3\) and \(162,\)"):
-        deformation_transfer.Carrier(face(0), face(1)[1:], FACES, MOVING)
+        deformation_transfer.DeformationTransfer(face(0), face(1)[1:], FACES, MOVING)
     with pytest.raises(ValueError, match=r"a motion per vertex.* and \(161,\)"):
-        deformation_transfer.Carrier(face(0), face(1), FACES, MOVING[1:])
+        deformation_transfer.DeformationTransfer(face(0), face(1), FACES, MOVING[1:])

@@ -26,13 +26,13 @@ def sheet(side=21):
 
 def test_the_rim_of_the_head_is_its_neck(template, landmarks):
     neck = next(loop for loop in graph.boundary_loops(template.faces) if len(loop) == 42)
-    found = rbf_weights.rim(template.vertices, template.faces, landmarks)
+    found = rbf_weights.distant_boundary(template.vertices, template.faces, landmarks)
     np.testing.assert_array_equal(found, np.sort(neck))
 
 
 def test_the_rim_of_a_mask_is_the_part_that_no_landmark_is_near():
     vertices, faces, marks = sheet()
-    found = rbf_weights.rim(vertices, faces, marks, reach=5)
+    found = rbf_weights.distant_boundary(vertices, faces, marks, reach=5)
     edge = np.flatnonzero((vertices[:, :2] == 0).any(axis=1) | (vertices[:, :2] == 20).any(axis=1))
     expected = [v for v in edge if min(np.linalg.norm(vertices[v] - m) for m in marks) > 5 * 2]
     np.testing.assert_array_equal(found, expected)
@@ -43,7 +43,7 @@ def test_falloff_on_the_head(template, landmarks):
     factor = rbf_weights.falloff(template.vertices, template.faces, landmarks)
     assert factor.dtype == np.float32 and factor.min() == 0 and factor.max() == 1
     np.testing.assert_array_equal(factor[template.landmarks], 1)
-    np.testing.assert_array_equal(factor[rbf_weights.rim(template.vertices, template.faces, landmarks)], 0)
+    np.testing.assert_array_equal(factor[rbf_weights.distant_boundary(template.vertices, template.faces, landmarks)], 0)
     inner = np.concatenate([loop for loop in graph.boundary_loops(template.faces) if len(loop) != 42])
     assert factor[inner].min() > 0.95
     assert factor[template.face_mask].mean() > 0.9
@@ -51,7 +51,7 @@ def test_falloff_on_the_head(template, landmarks):
 
 def test_falloff_against_a_loop():
     vertices, faces, marks = sheet()
-    pinned = rbf_weights.rim(vertices, faces, marks)
+    pinned = rbf_weights.distant_boundary(vertices, faces, marks)
     nearest = [min(np.linalg.norm(v - m) for m in marks) for v in vertices]
     end = min(nearest[v] for v in pinned)
     for value, distance in zip(rbf_weights.falloff(vertices, faces, marks), nearest, strict=True):
@@ -78,7 +78,7 @@ def test_falloff_knows_no_unit(template, landmarks):
 def test_a_closed_mesh_is_let_go_of_nowhere():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
-    assert len(rbf_weights.rim(vertices, faces, 0.1 * vertices)) == 0
+    assert len(rbf_weights.distant_boundary(vertices, faces, 0.1 * vertices)) == 0
     np.testing.assert_array_equal(rbf_weights.falloff(vertices, faces, 0.1 * vertices), 1)
 
 
@@ -108,7 +108,7 @@ def test_landmarks_off_the_mesh_are_named(template, landmarks, move, match):
 
 
 def test_the_sides_of_the_mouth(template, landmarks):
-    share = rbf_weights.side(template.vertices, template.faces, landmarks, rbf_weights.IBUG_LIPS)
+    share = rbf_weights.upper_lip_share(template.vertices, template.faces, landmarks, rbf_weights.IBUG_LIPS)
     upper, lower = (template.landmarks[list(lip)] for lip in rbf_weights.IBUG_LIPS)
     assert (share[upper] == 1).all() and (share[lower] == 0).all()
     # The rim of the mouth, which at rest is one line: its upper half goes with the upper lip.
@@ -117,16 +117,18 @@ def test_the_sides_of_the_mouth(template, landmarks):
     assert set(np.round(share[middle])) == {0, 1} and np.abs(share[middle] - 0.5).min() > 0.45
     assert np.abs(share[template.landmarks[[48, 54]]] - 0.5).max() < 0.35
     up = np.array([1, 2, 0])
-    swapped = rbf_weights.side(template.vertices, template.faces, landmarks, rbf_weights.IBUG_LIPS[::-1])
+    swapped = rbf_weights.upper_lip_share(template.vertices, template.faces, landmarks, rbf_weights.IBUG_LIPS[::-1])
     np.testing.assert_allclose(swapped, 1 - share, atol=1e-6)
-    turned = rbf_weights.side(template.vertices[:, up], template.faces, landmarks[:, up], rbf_weights.IBUG_LIPS)
+    turned = rbf_weights.upper_lip_share(
+        template.vertices[:, up], template.faces, landmarks[:, up], rbf_weights.IBUG_LIPS
+    )
     np.testing.assert_allclose(turned, share, atol=1e-5)
 
 
 def test_sides_where_no_way_leads():
     vertices, faces, _ = sheet(3)
     two = np.concatenate([vertices, vertices + [0, 0, 5]])
-    share = rbf_weights.side(two, np.concatenate([faces, faces + 9]), two[[0, 8]], ([0], [1]))
+    share = rbf_weights.upper_lip_share(two, np.concatenate([faces, faces + 9]), two[[0, 8]], ([0], [1]))
     assert share[0] == 1 and share[8] == 0 and (share[9:] == 0.5).all()
 
 
@@ -135,7 +137,7 @@ def test_weights_meet_the_landmarks_and_pin_the_rim(template, landmarks, lips):
     found = rbf_weights.weights(template.vertices, template.faces, landmarks, lips=lips)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found[template.landmarks], np.eye(68), atol=1e-6)
-    np.testing.assert_array_equal(found[rbf_weights.rim(template.vertices, template.faces, landmarks)], 0)
+    np.testing.assert_array_equal(found[rbf_weights.distant_boundary(template.vertices, template.faces, landmarks)], 0)
     if lips is None:
         factor = rbf_weights.falloff(template.vertices, template.faces, landmarks)[:, None]
         np.testing.assert_allclose(found, factor * rbf.weights(rbf.fit(landmarks), template.vertices), atol=1e-6)
@@ -170,7 +172,7 @@ def test_weights_refuse_landmarks_off_the_mesh(template, landmarks):
 
 def test_a_single_landmark_has_no_spacing(template):
     with pytest.raises(ValueError, match="at least 2, got 1"):
-        rbf_weights.rim(template.vertices, template.faces, np.zeros((1, 3)))
+        rbf_weights.distant_boundary(template.vertices, template.faces, np.zeros((1, 3)))
 
 
 def test_landmarks_in_one_place_are_named_as_the_user_counts_them():

@@ -35,7 +35,7 @@ def test_normals(dtype):
 
 def test_strain(dtype):
     vertices = jnp.asarray(fans(), dtype)
-    tables = strain.around(FACES, 4)
+    tables = strain.vertex_triangles(FACES, 4)
 
     def found(moved, vertices):
         return [x.swapaxes(0, 1) for x in strain.strain(moved.swapaxes(0, 1), vertices.swapaxes(0, 1), tables)]
@@ -76,7 +76,7 @@ def test_the_nearest_points_of_a_surface_of_such_triangles():
     on = closest_point.surface(vertices, faces)
     points = np.concatenate([vertices[rng.integers(len(vertices), size=COUNT // 10)], rng.normal(size=(1_000, 3))])
     for normals in (None, rng.normal(size=points.shape)):
-        hits = closest_point.query(on, points, normals=normals)
+        hits = closest_point.closest_points(on, points, normals=normals)
         assert all(np.isfinite(part).all() for part in hits)
         assert (hits.weights >= 0).all() and np.abs(hits.weights.sum(axis=1) - 1).max() < 1e-12
     assert np.isfinite(on.normals).all()
@@ -85,4 +85,4 @@ def test_the_nearest_points_of_a_surface_of_such_triangles():
 def test_a_face_with_a_triangle_of_no_area_carries_nothing():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0.5, 0]])
     with pytest.raises(ValueError, match="triangle 1 has no area"):
-        deformation_transfer.gradient(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+        deformation_transfer.gradient_operator(vertices, np.array([[0, 1, 2], [0, 2, 3]]))

@@ -11,7 +11,7 @@ from facejax.mesh import strain
 
 BALL = trimesh.creation.icosphere(subdivisions=1)  # 42 vertices
 VERTICES, FACES, N = np.asarray(BALL.vertices), np.asarray(BALL.faces), len(BALL.vertices)
-TABLES = strain.around(FACES, N)
+TABLES = strain.vertex_triangles(FACES, N)
 SIX = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -49,7 +49,7 @@ def plain(displacements, neutral, triangles):
 def test_tables_name_the_triangles_about_each_vertex():
     # A vertex of its own at the end, on an open mesh.
     triangles = FACES[5:]
-    tables = strain.around(triangles, N + 1)
+    tables = strain.vertex_triangles(triangles, N + 1)
     for vertex in range(N + 1):
         named = tables.about[vertex]
         assert sorted(named[named < len(triangles)]) == np.flatnonzero((triangles == vertex).any(axis=1)).tolist()
@@ -69,7 +69,7 @@ def test_strain_and_normals_are_those_of_the_plain_loop(scale):
 
 def test_on_an_open_mesh_a_vertex_of_no_triangle_has_none():
     triangles = FACES[5:]
-    tables = strain.around(triangles, N + 1)
+    tables = strain.vertex_triangles(triangles, N + 1)
     neutral = jnp.concatenate([faces(1), jnp.ones((1, 1, 3))])
     moved = 0.3 * array(1, N + 1, 1, 3)
     found, normals = strain.strain(moved, neutral, tables)
@@ -95,7 +95,7 @@ def test_a_uniform_stretch_is_that_in_all_directions_of_the_skin(stretch):
     exact = ((1 + stretch) ** 2 - 1) / 2
     np.testing.assert_allclose(found[..., :3].sum(axis=-1), 2 * exact, atol=1e-5)  # two directions, none across
     flat = jnp.asarray([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], jnp.float32)[:, None]
-    found, normals = strain.strain(stretch * flat, flat, strain.around(np.array([[0, 1, 2], [1, 3, 2]]), 4))
+    found, normals = strain.strain(stretch * flat, flat, strain.vertex_triangles(np.array([[0, 1, 2], [1, 3, 2]]), 4))
     np.testing.assert_allclose(found[:, 0], np.broadcast_to([exact, exact, 0, 0, 0, 0], (4, 6)), atol=1e-6)
     np.testing.assert_allclose(normals[:, 0], np.broadcast_to([0, 0, 1], (4, 3)), atol=1e-6)
 
@@ -121,7 +121,7 @@ def test_turning_the_face_or_the_moved_face():
 def test_a_triangle_without_area_adds_nothing():
     triangles = np.concatenate([FACES, [[0, 0, 1]]])
     neutral, moved = faces(1), 0.2 * array(1, N, 1, 3)
-    found, _ = strain.strain(moved, neutral, strain.around(triangles, N))
+    found, _ = strain.strain(moved, neutral, strain.vertex_triangles(triangles, N))
     expected, _ = strain.strain(moved, neutral, TABLES)
     assert jnp.isfinite(found).all()
     np.testing.assert_allclose(found[2:], expected[2:], atol=1e-6)

@@ -47,7 +47,7 @@ def test_eager_jit_and_vmap_agree(lead):
     params, _, _ = made("neutral")
     steps, neutral = jnp.asarray(array(3, *lead, F, L, 3)), jnp.asarray(array(4, *lead, L, 3))
     given = jnp.arange(F) % 3 == 0
-    for function, extra in ((expression_lstm.predict, ()), (expression_lstm.follow, (given,))):
+    for function, extra in ((expression_lstm.predict, ()), (expression_lstm.predict_scheduled, (given,))):
         found = function(params, steps, *extra, neutral)
         assert found.shape == steps.shape
         with jax.disable_jit():
@@ -107,7 +107,7 @@ def test_components_span_the_prediction():
     np.testing.assert_allclose(flat @ basis @ basis.T, flat, atol=1e-6)
     # All components are a rotation of the numbers: the loss of the data is the same.
     every = made(components=3 * L)[0].scale
-    x = np.asarray(expression_lstm._encode(expression_lstm.Params(every, None), jnp.asarray(steps), None)[0])
+    x = np.asarray(expression_lstm._encode(expression_lstm.ExpressionLSTM(every, None), jnp.asarray(steps), None)[0])
     np.testing.assert_allclose(np.sum(x**2), np.sum((steps / every.step) ** 2), rtol=1e-4)
 
 
@@ -120,19 +120,19 @@ def bump(rise, hold, fall, rest, height=1.0):
 
 
 def test_an_expression_is_over_when_it_is_home_and_quiet():
-    assert int(expression_lstm.ending(bump(8, 6, 10, 12))) == 8 + 6 + 10 + 1
+    assert int(expression_lstm.expression_length(bump(8, 6, 10, 12))) == 8 + 6 + 10 + 1
     # Held for ever, or still on the way: not over.
-    assert int(expression_lstm.ending(bump(8, 30, 0, 0))) == 39
-    assert int(expression_lstm.ending(bump(8, 6, 10, 3))) == 28
+    assert int(expression_lstm.expression_length(bump(8, 30, 0, 0))) == 39
+    assert int(expression_lstm.expression_length(bump(8, 6, 10, 3))) == 28
     # A second expression afterwards is cut off.
     twice = jnp.concatenate([bump(8, 6, 10, 12), bump(8, 6, 10, 12)])
-    assert int(expression_lstm.ending(twice)) == 25
+    assert int(expression_lstm.expression_length(twice)) == 25
     both = jnp.stack([bump(8, 6, 10, 12), bump(12, 2, 10, 12)])
-    np.testing.assert_array_equal(expression_lstm.ending(both), [25, 25])
+    np.testing.assert_array_equal(expression_lstm.expression_length(both), [25, 25])
 
 
 def test_a_face_that_never_moves_is_not_over():
-    assert int(expression_lstm.ending(jnp.zeros((20, L, 3)))) == 20
+    assert int(expression_lstm.expression_length(jnp.zeros((20, L, 3)))) == 20
 
 
 def test_stop_holds_the_face_still(monkeypatch):

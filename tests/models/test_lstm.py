@@ -54,17 +54,21 @@ def test_forward_is_the_loop(layers):
 def test_follow_is_the_loop(seed):
     weights, x = parameters(seed), array(2, T, B, D)
     given = np.random.default_rng(seed).random((T, B)) < 0.5
-    np.testing.assert_allclose(lstm.follow(weights, x, given), naive(weights, x, given), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        lstm.forward_scheduled(weights, x, given), naive(weights, x, given), rtol=1e-4, atol=1e-5
+    )
 
 
 def test_follow_with_all_inputs_given_is_forward():
     weights, x = parameters(), array(3, T, B, D)
-    np.testing.assert_allclose(lstm.follow(weights, x, jnp.ones((T, B), bool)), lstm.forward(weights, x), atol=1e-5)
+    np.testing.assert_allclose(
+        lstm.forward_scheduled(weights, x, jnp.ones((T, B), bool)), lstm.forward(weights, x), atol=1e-5
+    )
 
 
 def test_step_by_step_is_forward():
     weights, x = parameters(), array(4, T, B, D)
-    states, outputs = lstm.start(weights, B), []
+    states, outputs = lstm.init_states(weights, B), []
     for row in x:
         states, out = lstm.step(weights, states, row)
         outputs.append(out)
@@ -80,14 +84,14 @@ def loop(weights, x, given):
         states, out = lstm.step(weights, states, jnp.where(given[:, None], x, last))
         return (states, out), out
 
-    return jax.lax.scan(advance, (lstm.start(weights, x.shape[1]), jnp.zeros_like(x[0])), (x, given))[1]
+    return jax.lax.scan(advance, (lstm.init_states(weights, x.shape[1]), jnp.zeros_like(x[0])), (x, given))[1]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_gradients_are_those_of_the_automatic_way(share):
     weights, x = parameters(), array(5, T, B, D)
     given = jnp.asarray(np.random.default_rng(1).random((T, B)) < share)
-    forms = [lstm.follow, loop] + ([lambda w, x, _: lstm.forward(w, x)] if share == 1.0 else [])
+    forms = [lstm.forward_scheduled, loop] + ([lambda w, x, _: lstm.forward(w, x)] if share == 1.0 else [])
     slopes = [jax.grad(lambda w, x, f=f: jnp.sum(jnp.sin(f(w, x, given))), argnums=(0, 1))(weights, x) for f in forms]
     for other in slopes[1:]:
         for a, b in zip(jax.tree.leaves(slopes[0]), jax.tree.leaves(other), strict=True):
@@ -100,7 +104,9 @@ def test_gradients_are_finite_differences():
         x = jnp.asarray(array(6, 4, 2, D), jnp.float64)
         given = jnp.asarray([[True, True], [False, True], [True, False], [False, False]])
         check_grads(lstm.forward, (weights, x), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
-        check_grads(lambda w, x: lstm.follow(w, x, given), (weights, x), order=1, modes=["rev"], atol=1e-6, rtol=1e-6)
+        check_grads(
+            lambda w, x: lstm.forward_scheduled(w, x, given), (weights, x), order=1, modes=["rev"], atol=1e-6, rtol=1e-6
+        )
 
 
 def test_what_comes_later_changes_nothing_before():

@@ -30,7 +30,7 @@ def loss(params, key, batch, constants):
 
 
 def start():
-    return steps.start_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
+    return steps.init_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
 
 
 def batches(first, count):
@@ -114,7 +114,7 @@ def test_what_is_raised_is_not_lost_with_a_journal_that_cannot_be_closed(tmp_pat
             raise OSError("no space left")
 
     for inner, outer in ((RuntimeError("more"), RuntimeError), (None, OSError)):
-        record = metric_logger.Journal(tmp_path, 0, 3)
+        record = metric_logger.MetricLogger(tmp_path, 0, 3)
         record._file.close()
         record._file = Full()
         with pytest.raises(outer), record:
@@ -227,7 +227,7 @@ def test_epoch_indices_refuse_nothing():
 
 
 def test_gathered_steps_take_indices(tmp_path):
-    step = loop.gathered(steps.supervised(loss, OPTIMISER))
+    step = loop.gather_batches(steps.supervised(loss, OPTIMISER))
     held = (jnp.asarray(DATA), jnp.float32(0.5))
     indices = loop.epoch_indices(7, len(DATA), 8)
     state = loop.run(step, start(), indices, tmp_path / "indices", steps=8, constants=held, chunk=4)
@@ -236,7 +236,7 @@ def test_gathered_steps_take_indices(tmp_path):
 
 def test_the_average_follows_the_parameters_and_changes_nothing_else():
     plain, state = steps.supervised(loss, OPTIMISER), start()
-    step, other = steps.averaged(plain, 0.9), state._replace(extra=state.params)
+    step, other = steps.with_moving_average(plain, 0.9), state._replace(extra=state.params)
     average = np.asarray(state.params["w"], np.float64)
     for i in range(5):
         batch = batches(i, 1)[0]
@@ -261,7 +261,7 @@ def adversarial(optimiser, critic_steps):
     players = steps.Players(optimiser, optimiser)
     step = steps.adversarial(generate, score, players, critic_steps=critic_steps, terms=terms, decay=0.9)
     weights = steps.Players({"g": jnp.zeros((3, 2))}, {"c": 0.5 * jnp.ones((3, 2, 4))})
-    return step, steps.start_adversarial(weights, players, jax.random.key(0))
+    return step, steps.init_adversarial(weights, players, jax.random.key(0))
 
 
 def test_an_adversarial_step_moves_the_critic_first_and_averages_the_generator():
@@ -357,8 +357,8 @@ def apart(which, total, folder):
         rows = [loop.epoch_indices(i, 20, 8)(first, count) + 20 * i for i in which]
         return np.stack(rows, axis=1)
 
-    step = steps.side_by_side(steps.supervised(step_loss, OPTIMISER), [f"m{i}" for i in which], which)
-    state = steps.start_side_by_side(stacked, OPTIMISER, jax.random.key(3))
+    step = steps.vectorize_models(steps.supervised(step_loss, OPTIMISER), [f"m{i}" for i in which], which)
+    state = steps.init_vectorized_models(stacked, OPTIMISER, jax.random.key(3))
     constants = (own, jnp.asarray(DATASETS.reshape(-1, 4)))
     return loop.run(step, state, chosen, folder, steps=total, constants=constants, chunk=4)
 
@@ -394,7 +394,7 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
 
     rng = np.random.default_rng(0)
     batch = jnp.asarray(rng.normal(size=(3, 8, 4)), jnp.float32), jnp.asarray(rng.random((3, 8, 1)) < 0.4, jnp.float32)
-    state = steps.start_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
+    state = steps.init_supervised({"w": jnp.ones((4, 2))}, OPTIMISER, jax.random.key(3))
     step = steps.supervised(uneven, OPTIMISER)
     shared = jax.jit(sharding.data_parallel(step, axis=1))
     one, several = state, state
@@ -418,7 +418,7 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
     with pytest.raises(ValueError, match=r"a batch of shape \(\) cannot be shared out"):
         sharding.data_parallel(step)(state, 0.5, ())
     with pytest.raises(ValueError, match="axis: expected 0 or more, got -1"):
-        sharding.along(sharding.line(), -1)
+        sharding.split_along(sharding.data_mesh(), -1)
 
 
 def test_several_devices_share_models_and_batches():

@@ -40,7 +40,7 @@ def test_equals_the_loop(seed):
     nearness = rng.uniform(0.2, 1.0, 30)
     nearness[3] = 0  # behind the camera
     faces = rng.integers(0, 30, (25, 3))
-    hits = rasterizer.cast(points, nearness, faces, size)
+    hits = rasterizer.rasterize(points, nearness, faces, size)
     np.testing.assert_array_equal(_picture(hits, size), _naive(points, nearness, faces, size))
     np.testing.assert_allclose(hits.inside.sum(0), 1, atol=1e-5)
     places = np.einsum("cs,csx->sx", hits.inside, points[faces[hits.face]].transpose(1, 0, 2))
@@ -53,7 +53,7 @@ def test_triangles_that_share_edges_leave_no_gap():
     grid[1:-1, 1:-1] += rng.uniform(-2, 2, (7, 7, 2))
     a = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
     faces = np.concatenate([np.stack([a, a + 1, a + 10], -1), np.stack([a, a + 10, a + 9], -1)])
-    hits = rasterizer.cast(grid.reshape(-1, 2), np.ones(81), faces, (40, 40))
+    hits = rasterizer.rasterize(grid.reshape(-1, 2), np.ones(81), faces, (40, 40))
     np.testing.assert_array_equal(hits.sample, np.arange(1600))
     assert hits.inside.min() > -1e-3
 
@@ -61,7 +61,7 @@ def test_triangles_that_share_edges_leave_no_gap():
 @pytest.mark.parametrize("faces", [[[0, 1, 2], [2, 3, 0]], [[0, 2, 1], [2, 0, 3]], [[1, 0, 3], [1, 2, 3]]])
 def test_samples_on_whole_numbers_and_level_edges(faces):
     points = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], float)
-    hits = rasterizer.cast(points, np.ones(4), np.array(faces), (6, 6))
+    hits = rasterizer.rasterize(points, np.ones(4), np.array(faces), (6, 6))
     expected = np.zeros((6, 6), bool)
     expected[:5, :5] = True
     np.testing.assert_array_equal(_picture(hits, (6, 6)) >= 0, expected)
@@ -71,13 +71,13 @@ def test_the_nearer_wins_whatever_the_order_and_winding():
     points = np.array([[-9, -9], [30, -9], [-9, 30]] * 2, float)
     nearness = np.array([0.5, 0.5, 0.5, 0.500001, 0.500001, 0.500001])
     for faces in ([[0, 1, 2], [3, 4, 5]], [[3, 5, 4], [0, 1, 2]]):
-        hits = rasterizer.cast(points, nearness, np.array(faces), (5, 5))
+        hits = rasterizer.rasterize(points, nearness, np.array(faces), (5, 5))
         assert set(hits.face) == {faces.index(max(faces, key=max))} and len(hits.sample) == 25
 
 
 def test_nothing_to_draw():
-    nothing = rasterizer.cast(np.zeros((3, 2)), np.ones(3), np.array([[0, 1, 2]]), (4, 4))
+    nothing = rasterizer.rasterize(np.zeros((3, 2)), np.ones(3), np.array([[0, 1, 2]]), (4, 4))
     assert len(nothing.sample) == 0
-    assert len(rasterizer.cast(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), int), (4, 4)).sample) == 0
+    assert len(rasterizer.rasterize(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), int), (4, 4)).sample) == 0
     with pytest.raises(ValueError, match="at most"):
-        rasterizer.cast(np.zeros((3, 2)), np.ones(3), np.broadcast_to(np.int8(0), (1 << 24, 3)), (4, 4))
+        rasterizer.rasterize(np.zeros((3, 2)), np.ones(3), np.broadcast_to(np.int8(0), (1 << 24, 3)), (4, 4))

@@ -17,7 +17,7 @@ def _background(size=SIZE, **options):
 def test_the_whole_motion_is_framed_within_the_margin(moving):
     vertices, _ = moving
     for turn, tilt in ((0, 0), (50, 20), (-120, -40)):
-        view = render.aim(vertices, size=SIZE, turn=turn, tilt=tilt, margin=0.1)
+        view = render.fit_camera(vertices, size=SIZE, turn=turn, tilt=tilt, margin=0.1)
         z = (vertices - view.eye) @ view.turn.T
         shown = np.abs(z[..., :2] * view.zoom / -z[..., 2:]) / [SIZE[0] / SIZE[1], 1]
         assert shown.max() == pytest.approx(0.8, abs=1e-5)
@@ -26,8 +26,8 @@ def test_the_whole_motion_is_framed_within_the_margin(moving):
 
 
 def test_turn_and_tilt_go_the_way_they_say(ball):
-    left = render.aim(ball[0], turn=30).eye
-    above = render.aim(ball[0], tilt=30).eye
+    left = render.fit_camera(ball[0], turn=30).eye
+    above = render.fit_camera(ball[0], tilt=30).eye
     assert left[0] > 0 and left[2] > 0 and above[1] > 0 and above[2] > 0
 
 
@@ -48,7 +48,7 @@ def test_frames_are_the_single_images_under_one_camera(moving):
     vertices, faces = moving
     pictures = render.frames(vertices, faces, size=SIZE)
     assert pictures.shape == (5, 80, 64, 3) and pictures.dtype == np.uint8
-    view = render.aim(vertices, size=SIZE)
+    view = render.fit_camera(vertices, size=SIZE)
     for t in (0, 3):
         np.testing.assert_array_equal(pictures[t], render.image(vertices[t], faces, size=SIZE, camera=view))
     assert (pictures[0] != pictures[4]).any()
@@ -70,12 +70,12 @@ def test_the_neck_is_stopped_but_a_mask_is_not(ball):
     vertices, faces = ball
     centre = vertices[faces].mean(1)
     mask = faces[centre[:, 1] > -60]
-    assert len(props.stopper(vertices, faces)) == 0 and len(props.stopper(vertices, mask)) == 0
+    assert len(props.close_largest_hole(vertices, faces)) == 0 and len(props.close_largest_hole(vertices, mask)) == 0
     two_holes = mask[centre[centre[:, 1] > -60][:, 1] < 76]
-    closing = props.stopper(vertices, two_holes)
+    closing = props.close_largest_hole(vertices, two_holes)
     assert (vertices[closing][..., 1] < 0).all()
     # Closing the neck leaves one hole, and every new edge is used once in each direction.
-    assert len(props.stopper(vertices, np.concatenate([two_holes, closing]))) == 0
+    assert len(props.close_largest_hole(vertices, np.concatenate([two_holes, closing]))) == 0
     edges = np.concatenate([closing[:, [0, 1]], closing[:, [1, 2]], closing[:, [2, 0]]]).tolist()
     old = np.concatenate([two_holes[:, [0, 1]], two_holes[:, [1, 2]], two_holes[:, [2, 0]]]).tolist()
     assert all([b, a] in edges or [b, a] in old for a, b in edges)
@@ -94,12 +94,12 @@ def test_landmarks_are_dots_where_they_can_be_seen(ball):
 
 def test_colours_and_heat(ball):
     vertices, faces = ball
-    heat = render.heat(vertices[:, 1], low=-80, high=80)
+    heat = render.heat_colours(vertices[:, 1], low=-80, high=80)
     picture = render.image(vertices, faces, size=SIZE, colours=heat).astype(int)
     top, bottom = picture[20, 32], picture[60, 32]
     assert bottom[1] > top[1] + 30 and bottom[2] > top[2] + 10
-    np.testing.assert_allclose(render.heat([0, 5, 10])[[0, -1]], [[0.90, 0.90, 0.92], [0.35, 0.03, 0.16]])
-    np.testing.assert_allclose(render.heat([0.0, 0.0]), render.heat([0.0, 0.0], high=1))
+    np.testing.assert_allclose(render.heat_colours([0, 5, 10])[[0, -1]], [[0.90, 0.90, 0.92], [0.35, 0.03, 0.16]])
+    np.testing.assert_allclose(render.heat_colours([0.0, 0.0]), render.heat_colours([0.0, 0.0], high=1))
     with pytest.raises(ValueError, match="colours must be"):
         render.image(vertices, faces, colours=heat[:-1])
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax.data.importers.base import SourceError, Take
+from facejax.data.importers.base import Recording, SourceError
 from facejax.data.importers.tables import Row
 
 APEX, REST = 0.95, 0.05  # of the largest displacement: the apex lies above, rest below
@@ -33,7 +33,7 @@ def energy(curve: np.ndarray, rest: np.ndarray) -> np.ndarray:
     return np.linalg.norm(curve - rest, axis=-1).mean(axis=-1)
 
 
-def find(curve: np.ndarray, rest: np.ndarray) -> Cuts:
+def detect(curve: np.ndarray, rest: np.ndarray) -> Cuts:
     """The cuts of landmarks (T, L, 3) about those at rest (L, 3).
 
     By their mean displacement: the apex goes from the first to the last frame above 95 % of its maximum; the onset is
@@ -48,13 +48,13 @@ def find(curve: np.ndarray, rest: np.ndarray) -> Cuts:
     return Cuts(int(onset), int(apex[0]), int(apex[-1]), int(offset))
 
 
-def restless(curve: np.ndarray, rest: np.ndarray, cuts: Cuts) -> tuple[bool, bool]:
+def not_at_rest(curve: np.ndarray, rest: np.ndarray, cuts: Cuts) -> tuple[bool, bool]:
     """Whether a recording does not begin, and does not end, at rest."""
     moved = energy(curve, rest)
     return tuple(bool(moved[frame] >= REST * moved.max()) for frame in (cuts.onset, cuts.offset))
 
 
-def visits(curve: np.ndarray, rest: np.ndarray) -> int:
+def count_returns(curve: np.ndarray, rest: np.ndarray) -> int:
     """How often landmarks (T, L, 3) go more than half of their farthest way from rest (L, 3), and come home between."""
     moved = energy(curve, rest)
     far, home = moved > 0.5 * moved.max(), moved < 2 * REST * moved.max()
@@ -70,13 +70,13 @@ def jumps(curve: np.ndarray) -> list[int]:
     return [int(frame) + 1 for frame in np.flatnonzero(steps > limit)]
 
 
-def named(rows: Sequence[Row], takes: Sequence[Take], people: Sequence[str]) -> dict[int, Cuts]:
+def cuts_from_table(rows: Sequence[Row], takes: Sequence[Recording], people: Sequence[str]) -> dict[int, Cuts]:
     """Cuts of takes, by their number, from rows of subject, recording, onset, apex_start, apex_end and offset.
 
     Raises `SourceError` for a recording that is not there, and for frames that do not rise or are not there.
     """
     found = {}
-    for at, row in numbers(rows, takes, people).items():
+    for at, row in match_rows(rows, takes, people).items():
         cuts = Cuts(*(row.whole(name) for name in Cuts._fields))
         last = takes[at].count - 1
         if not 0 <= cuts.onset <= cuts.apex_start <= cuts.apex_end <= cuts.offset <= last:
@@ -87,7 +87,7 @@ def named(rows: Sequence[Row], takes: Sequence[Take], people: Sequence[str]) -> 
     return found
 
 
-def numbers(rows: Sequence[Row], takes: Sequence[Take], people: Sequence[str]) -> dict[int, Row]:
+def match_rows(rows: Sequence[Row], takes: Sequence[Recording], people: Sequence[str]) -> dict[int, Row]:
     """Which take each row names by `subject` and `recording`.
 
     Raises `SourceError`: there is none, or two rows name one.

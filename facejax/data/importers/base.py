@@ -33,7 +33,7 @@ class Person(NamedTuple):
     about: dict[str, Any]
 
 
-class Take(NamedTuple):
+class Recording(NamedTuple):
     """One recording."""
 
     subject: int
@@ -51,8 +51,8 @@ class Source(NamedTuple):
     layout: str
     root: Path
     people: tuple[Person, ...]
-    takes: tuple[Take, ...]  # sorted by subject, then name
-    read: Callable[[Take, Sequence[int] | None], Iterator[Frame]]  # frames of some numbers, or all
+    takes: tuple[Recording, ...]  # sorted by subject, then name
+    read: Callable[[Recording, Sequence[int] | None], Iterator[Frame]]  # frames of some numbers, or all
     rest: Callable[[int], Iterator[Frame]]  # of a subject: meshes whose mean is the face at rest
     files: tuple[Path, ...]  # all that is read
     rate: float
@@ -141,14 +141,14 @@ def size(vertices: np.ndarray) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def natural(name: str) -> tuple:
+def natural_sort_key(name: str) -> tuple:
     """A key that sorts numbers in names by their value, and letters without regard to case."""
     parts = re.split(r"(\d+)", name.lower())
     # Numbers stand at odd places. The name itself decides between "a1" and "a01".
     return tuple(int(part) if i % 2 else part for i, part in enumerate(parts)), name
 
 
-def some(names: Sequence[str]) -> str:
+def abbreviate_names(names: Sequence[str]) -> str:
     """Three names, and how many more there are."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
@@ -162,12 +162,12 @@ def label_of(name: str) -> str:
     return re.sub(r"_\d+$", "", label) or label
 
 
-def numbered(paths: Sequence[Path], *, step: int | None = 1, gaps: bool = False) -> list[str]:
+def check_frame_numbers(paths: Sequence[Path], *, step: int | None = 1, gaps: bool = False) -> list[str]:
     """What is odd in the numbers at the end of frames' names: "frames 12 to 13 are missing".
 
     Args:
       paths: frames of one recording, sorted; names without a number are not looked at, if none has one.
-      step: from one number to the next; None takes `step_of`.
+      step: from one number to the next; None takes `frame_step`.
       gaps: say what is missing instead of raising.
 
     Raises:
@@ -178,7 +178,7 @@ def numbered(paths: Sequence[Path], *, step: int | None = 1, gaps: bool = False)
         return []
     if None in numbers:
         raise SourceError(f"{paths[numbers.index(None)]}: has no frame number, unlike the others beside it")
-    step, said = step_of(paths) if step is None else step, []
+    step, said = frame_step(paths) if step is None else step, []
     for number, following, path, other in zip(numbers, numbers[1:], paths, paths[1:], strict=False):
         if number == following:
             raise SourceError(f"{other}: frame {number} is {path.name} already")
@@ -192,7 +192,7 @@ def numbered(paths: Sequence[Path], *, step: int | None = 1, gaps: bool = False)
     return said
 
 
-def step_of(paths: Sequence[Path]) -> int:
+def frame_step(paths: Sequence[Path]) -> int:
     """The smallest step between the numbers of frames in order; 1 where there are none."""
     numbers = [number for path in paths if (number := _number(path)) is not None]
     return max(1, min((b - a for a, b in zip(numbers, numbers[1:], strict=False)), default=1))

@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Person, Source, SourceError, Take
+from facejax.data.importers.base import Person, Recording, Source, SourceError
 
 EMOTIONS = {"AN": "angry", "DI": "disgust", "FE": "fear", "HA": "happy", "SA": "sad", "SU": "surprise"}
 LANDMARKS = 66
@@ -34,7 +34,9 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
         raise SourceError(f"{root}: none of {len(names)} people has a neutral mesh (F0001_NE00WH_F3D)")
     notes, takes, neutral = [], [], []
     if left := [name for name in names if name not in kept]:
-        notes.append(f"{len(left)} of {len(names)} people have no neutral mesh and are left out: {base.some(left)}")
+        notes.append(
+            f"{len(left)} of {len(names)} people have no neutral mesh and are left out: {base.abbreviate_names(left)}"
+        )
     missing, absent = [], []
     for subject, name in enumerate(kept):
         rest = next(path for key, path in sorted(found.items()) if key[:2] == (name, "NE"))
@@ -48,12 +50,16 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
                 frames = (rest, *levels.values())
                 last = len(frames) - 1
                 takes.append(
-                    Take(subject, label, f"{name}/{label}", rest.parent, frames, len(frames), (0, last, last, last))
+                    Recording(
+                        subject, label, f"{name}/{label}", rest.parent, frames, len(frames), (0, last, last, last)
+                    )
                 )
     if missing:
-        notes.append(f"{len(missing)} strengths are missing, their emotions have fewer frames: {base.some(missing)}")
+        notes.append(
+            f"{len(missing)} strengths are missing, their emotions have fewer frames: {base.abbreviate_names(missing)}"
+        )
     if absent:
-        notes.append(f"{len(absent)} emotions are missing: {base.some(absent)}")
+        notes.append(f"{len(absent)} emotions are missing: {base.abbreviate_names(absent)}")
     if not takes:
         raise SourceError(f"{root}: holds neutral meshes alone, expected emotions (F0001_AN01WH_F3D)")
     return Source(
@@ -74,7 +80,7 @@ def _meshes(root: Path) -> dict[tuple[str, str, int], Path]:
     if not root.is_dir():
         raise SourceError(f"{root}: {'not a folder' if root.exists() else 'no such folder'}")
     found: dict[tuple[str, str, int], Path] = {}
-    for path in sorted(root.rglob("*"), key=lambda p: base.natural(p.as_posix())):
+    for path in sorted(root.rglob("*"), key=lambda p: base.natural_sort_key(p.as_posix())):
         match = _NAME.fullmatch(path.stem)
         if match is None or path.suffix.lower() not in folder_scan.SUFFIXES or not path.is_file():
             continue

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Frame, Person, Source, SourceError, Take
+from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
 from facejax.io import landmarks, meshes
 
 RATE = 25.0
@@ -40,9 +40,9 @@ def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", ga
             frames = tuple(p for p in folder_scan.entries(path) if p.suffix.lower() == ".bnd")
             if not frames:
                 raise SourceError(f"{path}: holds no landmarks; expected 000.bnd and so on")
-            notes += base.numbered(frames, gaps=gaps)
+            notes += base.check_frame_numbers(frames, gaps=gaps)
             label = base.label_of(path.name)
-            own.append(Take(len(people), label, f"{folder.name}/{path.name}", path, frames, len(frames)))
+            own.append(Recording(len(people), label, f"{folder.name}/{path.name}", path, frames, len(frames)))
         people.append(Person(folder.name, {"sex": _SEX[match[1].upper()]}))
         takes += own
     if not people:
@@ -63,7 +63,7 @@ def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", ga
     )
 
 
-def read(take: Take, which: Sequence[int] | None) -> Iterator[Frame]:
+def read(take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
     """Each frame's landmarks (83, 3). Raises `SourceError`, naming file and line."""
     for path in take.frames if which is None else [take.frames[i] for i in which]:
         try:
@@ -75,7 +75,7 @@ def read(take: Take, which: Sequence[int] | None) -> Iterator[Frame]:
         yield str(path), meshes.Mesh(found.points, None)
 
 
-def _rest(takes: tuple[Take, ...], rest: str, subject: int) -> Iterator[Frame]:
+def _rest(takes: tuple[Recording, ...], rest: str, subject: int) -> Iterator[Frame]:
     own = [take for take in takes if take.subject == subject]
     for take in own[:1] if rest == "first" else own:
         yield next(read(take, [0]))

@@ -24,7 +24,7 @@ def prepare(
     rate: float = 30.0,
     most: int = ingest.MOST,
     progress: ingest.Progress | None = None,
-) -> dataset.Store:
+) -> dataset.Dataset:
     """`scan` and `ingest.prepare` in one: the meshes under `root` in a new store at `out`.
 
     Raises `SourceError`, and leaves nothing, where something is wrong with the meshes.

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from facejax.data.importers import base
-from facejax.data.importers.base import Frame, Person, Source, SourceError, Take
+from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
 from facejax.io import meshes
 
 SUFFIXES = (".ply", ".obj", ".npy", ".npz")
@@ -61,25 +61,25 @@ def scan(
                 stray.append(path)
                 continue
             take = _take(index, folder.name, path)
-            notes += base.numbered(take.frames, step=step, gaps=gaps)
+            notes += base.check_frame_numbers(take.frames, step=step, gaps=gaps)
             if (twin := own.setdefault(_plain(path), take)) is not take:
                 raise SourceError(f"{path}: the recording {_plain(path)!r} is {twin.path.name} already")
         if not own:
             raise SourceError(f"{folder}: holds no recordings; expected RECORDING/*.ply or RECORDING.npz")
         people.append(Person(folder.name, {}))
         neutral.append(still[0] if still else None)
-        takes += [own[name] for name in sorted(own, key=base.natural)]
-    steps = [base.step_of(take.frames) for take in takes]
+        takes += [own[name] for name in sorted(own, key=base.natural_sort_key)]
+    steps = [base.frame_step(take.frames) for take in takes]
     usual = max(set(steps), key=steps.count)
     if odd := [f"{t.name} ({n})" for t, n in zip(takes, steps, strict=True) if t.frames and n != usual]:
-        notes.append(f"frames are numbered in steps of {usual}, but elsewhere: {base.some(odd)}")
+        notes.append(f"frames are numbered in steps of {usual}, but elsewhere: {base.abbreviate_names(odd)}")
     without = [person.name for person, path in zip(people, neutral, strict=True) if path is None]
     if without:
         first = "the first frame of the first recording" if rest == "first" else "the mean of the first frames"
-        notes.append(f"no neutral mesh, at rest in {first}: {base.some(without)}")
+        notes.append(f"no neutral mesh, at rest in {first}: {base.abbreviate_names(without)}")
     if stray:
         names = [path.relative_to(root).as_posix() for path in stray]
-        notes.append(f"passed over, as meshes outside the folders of recordings: {base.some(names)}")
+        notes.append(f"passed over, as meshes outside the folders of recordings: {base.abbreviate_names(names)}")
     return Source(
         layout,
         root,
@@ -93,7 +93,7 @@ def scan(
     )
 
 
-def read(rate: float, take: Take, which: Sequence[int] | None) -> Iterator[Frame]:
+def read(rate: float, take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
     """Each frame of a recording, or those of some numbers, with its name for messages; of a folder one at a time.
 
     Raises `SourceError` where a frame cannot be read or is not finite, or an NPZ says another `rate`.
@@ -130,12 +130,14 @@ def folders(root: Path, expected: str) -> list[Path]:
 def entries(folder: Path) -> list[Path]:
     """What lies in a folder and is not hidden, in natural order. Raises `SourceError`."""
     try:
-        return sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: base.natural(p.name))
+        return sorted(
+            (p for p in folder.iterdir() if not p.name.startswith(".")), key=lambda p: base.natural_sort_key(p.name)
+        )
     except OSError as error:
         raise SourceError(f"{folder}: cannot be read: {error.strerror or error}") from error
 
 
-def _rest(neutral: tuple[Path | None, ...], takes: tuple[Take, ...], rate: float, rest: str, subject: int):
+def _rest(neutral: tuple[Path | None, ...], takes: tuple[Recording, ...], rate: float, rest: str, subject: int):
     if (path := neutral[subject]) is not None:
         yield str(path), mesh(path)
         return
@@ -144,7 +146,7 @@ def _rest(neutral: tuple[Path | None, ...], takes: tuple[Take, ...], rate: float
         yield next(read(rate, take, [0]))
 
 
-def _take(subject: int, name: str, path: Path) -> Take:
+def _take(subject: int, name: str, path: Path) -> Recording:
     if _plain(path) == NEUTRAL:
         raise SourceError(f"{path}: the face at rest is one mesh, {NEUTRAL}.ply say; give a recording another name")
     if ">" in path.name:  # the mark of a direct transition in a store
@@ -152,7 +154,7 @@ def _take(subject: int, name: str, path: Path) -> Take:
     label = base.label_of(_plain(path))
     frames = _frames_of(path)
     count = len(frames) or _told(meshes.count_frames, path)
-    return Take(subject, label, f"{name}/{path.name if frames else path.stem}", path, frames, count)
+    return Recording(subject, label, f"{name}/{path.name if frames else path.stem}", path, frames, count)
 
 
 def _plain(path: Path) -> str:

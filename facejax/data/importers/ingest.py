@@ -54,7 +54,7 @@ def prepare(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> dataset.Store:
+) -> dataset.Dataset:
     """Read recordings into a new store at `out`, in millimetres; `index["notes"]` says what was assumed and is odd.
 
     Args:
@@ -77,14 +77,14 @@ def prepare(
     part = out.absolute().parent / f".{out.name}.part"
     try:
         _begin(part, job, _key(job, request))
-        worker.do_all(job, workers, progress)
+        worker.import_all(job, workers, progress)
         _finish(job, notes, part / "store")
         os.replace(part / "store", out)
     except SourceError:
         shutil.rmtree(part, ignore_errors=True)
         raise
     shutil.rmtree(part)
-    return dataset.open_store(out)
+    return dataset.open_dataset(out)
 
 
 def check_request(recordings: Source, out: Path, request: Request) -> None:
@@ -121,12 +121,12 @@ def _job(found: Source, out: Path, request: Request) -> tuple[worker.Job, list[s
     if shared_by := len(index) - len(np.unique(index)):
         notes.append(f"{request.landmarks}: {shared_by} of {len(index)} landmarks share a vertex with another")
     notes += _faceless(shared.vertices[index], request.landmarks)
-    neutral = np.stack([worker.millimetres(base.neutral(found, i, shared), scale) for i in range(len(found.people))])
+    neutral = np.stack([worker.to_millimetres(base.neutral(found, i, shared), scale) for i in range(len(found.people))])
     starts = np.cumsum([0, *(take.count for take in found.takes)])
     most = 0 if found.landmarks_only else request.most
     drawn = np.sort(np.random.default_rng([SEED, 2**20]).permutation(int(starts[-1]))[:most])
     part = out.absolute().parent / f".{out.name}.part"
-    hold = worker.stable(index) if request.hold else None
+    hold = worker.stable_landmarks(index) if request.hold else None
     return worker.Job(found, shared, index, unit, scale, neutral, starts, drawn, part, hold, dict(request.cuts)), notes
 
 
@@ -150,7 +150,7 @@ def _begin(part: Path, job: worker.Job, key: str) -> None:
     (part / "done").mkdir()
     shape = (len(job.drawn), *job.common.vertices.shape)
     np.lib.format.open_memmap(part / "store" / "vertices.npy", "w+", np.float32, shape).flush()
-    with atomic.replacing(mark) as temporary:
+    with atomic.replace_file(mark) as temporary:
         temporary.write_text(key)
 
 
@@ -169,7 +169,7 @@ def _finish(job: worker.Job, notes: list[str], folder: Path) -> None:
     curves = np.lib.format.open_memmap(folder / "landmarks.npy", "w+", np.float32, (rows, count, 3))
     sequences, said = [], []
     for number, take in enumerate(found.takes):
-        done = worker.read(job, number)
+        done = worker.load_result(job, number)
         start = int(job.starts[number])
         curves[start : start + take.count] = done.curve
         timing = (*done.cuts, take.count / found.rate)

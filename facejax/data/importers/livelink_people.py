@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Frame, Person, Source, SourceError, Take
+from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
 from facejax.data.synthetic import assets, makehuman, makehuman4d, rig
 from facejax.io import livelink, meshes
 
@@ -46,7 +46,7 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level
     for person in range(actors):
         for path in recordings[person % len(performers)]:
             name = f"{_name(performers, person, root)}/{path.stem}"
-            takes.append(Take(person, base.label_of(path.stem), name, path, (), counts[path]))
+            takes.append(Recording(person, base.label_of(path.stem), name, path, (), counts[path]))
     loaded = assets.load()
     return Source(
         "livelink",
@@ -92,7 +92,7 @@ def _rig(person: int, level: int) -> rig.Rig:
     return rig.build(makehuman.subject(person, seed=makehuman4d.SEED), level=level)
 
 
-def _read(rate: float, level: int, take: Take, which: Sequence[int] | None) -> Iterator[Frame]:
+def _read(rate: float, level: int, take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
     weights, skin = _weights(take.path, rate)[0], assets.load().skin
     numbers = np.arange(len(weights)) if which is None else np.asarray(which)
     for low in range(0, len(numbers), CHUNK):

@@ -51,7 +51,7 @@ def prepare(
     workers: int | None = None,
     progress: ingest.Progress | None = None,
     **options: Any,
-) -> dataset.Store:
+) -> dataset.Dataset:
     """Read a user's recordings into a new store at `out`; called again after an interruption, it goes on.
 
     Args:
@@ -96,7 +96,7 @@ def scan(layout: str, root: Path, **options: Any) -> Source:
 def with_labels(found: Source, path: Path) -> Source:
     """Other labels, from a table of subject, recording and label. Raises `SourceError`, naming the line."""
     rows = tables.read(path, ("subject", "recording", "label"), ())
-    at = apex_detection.numbers(rows, found.takes, [who.name for who in found.people])
+    at = apex_detection.match_rows(rows, found.takes, [who.name for who in found.people])
     takes = list(found.takes)
     for number, row in at.items():
         if ">" in (label := row.values["label"].lower()):
@@ -126,4 +126,4 @@ def with_people(found: Source, path: Path) -> Source:
 def cuts_of(found: Source, path: Path) -> dict[int, apex_detection.Cuts]:
     """The cuts of recordings, by number, from a table of subject, recording and `cuts.Cuts`' fields."""
     rows = tables.read(path, ("subject", "recording", *apex_detection.Cuts._fields), ())
-    return apex_detection.named(rows, found.takes, [who.name for who in found.people])
+    return apex_detection.cuts_from_table(rows, found.takes, [who.name for who in found.people])

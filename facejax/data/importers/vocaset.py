@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Frame, Person, Source, SourceError, Take
+from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
 from facejax.io import meshes, npz, safe_pickle
 
 RATE = 60.0
@@ -50,13 +50,15 @@ def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = 
             f"got {len(topology.vertices)}"
         )
     people, takes, still, notes = [], [], [], []
-    for name, sentences in sorted(_dict(index, paths[1]).items(), key=lambda row: base.natural(str(row[0]))):
+    for name, sentences in sorted(_dict(index, paths[1]).items(), key=lambda row: base.natural_sort_key(str(row[0]))):
         still.append(_rest_of(rests, name, vertices.shape[1], paths[2]))
-        for sentence, frames in sorted(_dict(sentences, paths[1], name).items(), key=lambda r: base.natural(r[0])):
+        for sentence, frames in sorted(
+            _dict(sentences, paths[1], name).items(), key=lambda r: base.natural_sort_key(r[0])
+        ):
             where = f"{paths[1]}: {name}/{sentence}"
             rows, odd = _rows(_dict(frames, paths[1], name, sentence), len(vertices), where, gaps)
             notes += odd
-            take = Take(
+            take = Recording(
                 len(people), base.label_of(sentence), f"{name}/{sentence}", Path(name) / sentence, (), len(rows)
             )
             takes.append((take, rows))
@@ -110,7 +112,7 @@ def _dict(value: Any, path: Path, *keys: str) -> dict:
     return value
 
 
-def _read(path: Path, table: dict[str, np.ndarray], take: Take, which: Sequence[int] | None) -> Iterator[Frame]:
+def _read(path: Path, table: dict[str, np.ndarray], take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
     vertices, rows = npz.map_npy(path), table[take.name]
     for i in range(len(rows)) if which is None else which:
         frame = np.asarray(vertices[rows[i]], np.float64)

@@ -41,7 +41,7 @@ class Job(NamedTuple):
     cuts: dict[int, apex_detection.Cuts]
 
 
-class Done(NamedTuple):
+class Result(NamedTuple):
     """A recording that was read."""
 
     curve: np.ndarray  # (T, L, 3) float32 mm
@@ -51,7 +51,7 @@ class Done(NamedTuple):
     jumps: list[int]
 
 
-def do_all(job: Job, workers: int | None, progress: Callable[[int, int], None]) -> None:
+def import_all(job: Job, workers: int | None, progress: Callable[[int, int], None]) -> None:
     """Do what is not done yet. Raises `SourceError` of the first recording in order that has something wrong."""
     total = len(job.source.takes)
     todo = [number for number in range(total) if not _path(job, number).exists()]
@@ -59,7 +59,7 @@ def do_all(job: Job, workers: int | None, progress: Callable[[int, int], None]) 
     workers = workers or (min(os.cpu_count() or 1, len(todo)) if frames > MANY else 1)
     if workers <= 1:
         for done, number in enumerate(todo, 1):
-            do(job, number)
+            import_recording(job, number)
             progress(total - len(todo) + done, total)
         return
     # Spawned, not forked: a fork of a process whose libraries run threads can hang.
@@ -73,7 +73,7 @@ def do_all(job: Job, workers: int | None, progress: Callable[[int, int], None]) 
             raise
 
 
-def do(job: Job, number: int) -> None:
+def import_recording(job: Job, number: int) -> None:
     """Read and check a recording, write its drawn meshes into the store, and leave the rest in a file."""
     take, start = job.source.takes[number], int(job.starts[number])
     if take.count < 2:
@@ -87,7 +87,7 @@ def do(job: Job, number: int) -> None:
     for read, frame in enumerate(job.source.read(take, None)):
         if read >= take.count:
             break
-        vertices = millimetres(job.common.check(*frame), job.scale)
+        vertices = to_millimetres(job.common.check(*frame), job.scale)
         if job.hold is not None:
             vertices = _held(vertices, rest, job.index[job.hold])
         curve[read] = vertices[job.index]
@@ -100,42 +100,44 @@ def do(job: Job, number: int) -> None:
     marks = rest[job.index]
     if apex_detection.energy(curve, marks).max() < apex_detection.STILL:
         raise SourceError(f"{take.path}: its landmarks never leave the face at rest, expected a motion")
-    cut = job.cuts.get(number) or take.cuts or apex_detection.find(curve, marks)
-    restless = apex_detection.restless(curve, marks, apex_detection.Cuts(*cut))
-    with atomic.replacing(_path(job, number)) as temporary:
-        visits = apex_detection.visits(curve, marks)
+    cut = job.cuts.get(number) or take.cuts or apex_detection.detect(curve, marks)
+    restless = apex_detection.not_at_rest(curve, marks, apex_detection.Cuts(*cut))
+    with atomic.replace_file(_path(job, number)) as temporary:
+        visits = apex_detection.count_returns(curve, marks)
         jumps = np.array(apex_detection.jumps(curve), np.int64)
         np.savez(temporary, curve=curve, cuts=cut, restless=restless, visits=visits, jumps=jumps)
 
 
-def read(job: Job, number: int) -> Done:
-    """What `do` left."""
+def load_result(job: Job, number: int) -> Result:
+    """What `import_recording` left."""
     with np.load(_path(job, number), allow_pickle=False) as found:
         cut = apex_detection.Cuts(*found["cuts"].tolist())
         restless, visits = tuple(found["restless"].tolist()), int(found["visits"])
-        return Done(found["curve"], cut, restless, visits, found["jumps"].tolist())
+        return Result(found["curve"], cut, restless, visits, found["jumps"].tolist())
 
 
-def notes(job: Job, done: list[Done]) -> list[str]:
+def notes(job: Job, done: list[Result]) -> list[str]:
     """What is odd in the recordings."""
     said, names = [], [take.name for take in job.source.takes]
     for i, verb in enumerate(("begin", "end")):
         which = [name for name, one in zip(names, done, strict=True) if one.restless[i]]
         if which:
-            said.append(f"{len(which)} of {len(names)} recordings do not {verb} at rest: {base.some(which)}")
+            said.append(
+                f"{len(which)} of {len(names)} recordings do not {verb} at rest: {base.abbreviate_names(which)}"
+            )
     several = [name for name, one in zip(names, done, strict=True) if one.visits > 1]
     if several:
         said.append(
             f"{len(several)} of {len(names)} recordings come home more than once, as if they held several expressions: "
-            f"{base.some(several)}"
+            f"{base.abbreviate_names(several)}"
         )
     jumps = [f"{name} frame {frame}" for name, one in zip(names, done, strict=True) for frame in one.jumps]
     if jumps:
-        said.append(f"the landmarks jump at {base.some(jumps)}")
+        said.append(f"the landmarks jump at {base.abbreviate_names(jumps)}")
     return said
 
 
-def stable(index: np.ndarray) -> np.ndarray:
+def stable_landmarks(index: np.ndarray) -> np.ndarray:
     """Which of L landmarks stay put in the head's own frame. Raises `SourceError` where the scheme is unknown."""
     try:
         return np.asarray(schemes.by_count(len(index)).stable)
@@ -143,7 +145,7 @@ def stable(index: np.ndarray) -> np.ndarray:
         raise SourceError(f"to hold heads still, landmarks of a known scheme are needed: {error}") from error
 
 
-def millimetres(vertices: np.ndarray, scale: float) -> np.ndarray:
+def to_millimetres(vertices: np.ndarray, scale: float) -> np.ndarray:
     """float32, in mm."""
     return (vertices * scale).astype(np.float32)
 
@@ -176,4 +178,4 @@ def _follow() -> None:
 
 
 def _do(number: int) -> None:
-    do(_JOB, number)
+    import_recording(_JOB, number)

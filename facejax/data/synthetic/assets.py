@@ -156,7 +156,7 @@ def _build(archive: Path, path: Path) -> None:
             for name, member in _target_members(zipped)
         }
     document = json.loads(resources.files("facejax.assets").joinpath("landmarks68_makehuman.json").read_text())
-    with atomic.replacing(path) as temporary:
+    with atomic.replace_file(path) as temporary:
         np.savez_compressed(
             temporary,
             base=(vertices[source_index] * DECIMETRE).astype(np.float32),

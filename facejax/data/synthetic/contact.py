@@ -83,7 +83,7 @@ def slide_lids(contact: Contact, vertices: np.ndarray) -> np.ndarray:
     return moved
 
 
-def keep_off_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
+def clear_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
     """Keep the inside of the lips in front of the dental arch; done in the jaw's frame, before it rotates."""
     moved = vertices.copy()
     near = moved[:, contact.teeth_index]
@@ -92,7 +92,7 @@ def keep_off_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
     return moved
 
 
-def part_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
+def separate_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
     """Where the lower lip's edge has passed the upper's, move both back by half, and the flesh behind them along."""
     upper, lower = contact.lip_pairs.T
     gap = vertices[:, upper, 1] - vertices[:, lower, 1]

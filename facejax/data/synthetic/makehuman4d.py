@@ -63,12 +63,12 @@ class Spec(NamedTuple):
 
 def prepare(
     spec: Spec = Spec(), *, folder: Path | None = None, progress: Callable[[int, int], None] | None = None
-) -> dataset.Store:
+) -> dataset.Dataset:
     """Open the dataset, making it first if it is absent (minutes; `progress(done, total)` counts subjects)."""
     path = Path(folder or cache.folder()) / spec.name
     if not (path / "index.json").exists():
         _make(spec, path, progress or (lambda done, total: None))
-    return dataset.open_store(path)
+    return dataset.open_dataset(path)
 
 
 def split_of(index: int, subjects: int) -> str:
@@ -95,7 +95,7 @@ def _plan(spec: Spec) -> tuple[list[dataset.Sequence], list[np.ndarray], list[np
 def _direct(start: str, end: str, index: int, seed: int) -> performance.Performance:
     weights = performance.direct(start, end, index, seed=seed)
     last = len(weights) - 1
-    duration = len(weights) / performance.HANDED_OUT
+    duration = len(weights) / performance.STORED_RATE
     return performance.Performance(weights, np.zeros((len(weights), 3), np.float32), 0, last, last, last, duration)
 
 
@@ -115,7 +115,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
         "landmark_index": loaded.landmarks.shape,
     }
     people = []
-    with atomic.replacing_folder(path) as temporary:
+    with atomic.replace_folder(path) as temporary:
 
         def array(name):
             return np.lib.format.open_memmap(temporary / f"{name}.npy", "w+", np.float32, shapes[name])
@@ -131,7 +131,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             for low in range(0, len(moves), CHUNK):
                 skin = rig.pose(posed, moves[low : low + CHUNK])[:, : loaded.skin]
                 if spec.head_motion:
-                    skin = turn(skin, head[low : low + CHUNK])
+                    skin = rotate_head(skin, head[low : low + CHUNK])
                 row = first[mine[0]] + low
                 if spec.noise:
                     rng = np.random.default_rng([spec.seed, 2**21, row])
@@ -161,7 +161,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             "spec": spec._asdict(),
             "source": {"file": assets.WHEEL, "sha256": assets.WHEEL_SHA256},
             "unit": "mm",
-            "rate": performance.HANDED_OUT,
+            "rate": performance.STORED_RATE,
             "labels": performance.LABELS,
             "shapes": shapes,
             "hashes": {name: atomic.sha256(temporary / f"{name}.npy") for name in shapes},
@@ -171,7 +171,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
         (temporary / "index.json").write_text(json.dumps(index))
 
 
-def turn(vertices: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def rotate_head(vertices: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Rigid head motion about the neck: vertices (T, N, 3), angles (T, 3) pitch (back), yaw, roll in radians."""
     pitch, yaw, roll = np.moveaxis(np.asarray(angles, np.float64), -1, 0)
     one, zero = np.ones_like(pitch), np.zeros_like(pitch)

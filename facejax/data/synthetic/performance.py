@@ -37,7 +37,7 @@ EXPRESSIONS = COMA + EMOTIONS
 LABELS = (NEUTRAL, *EXPRESSIONS)
 
 RATE = 60  # frames per second, performed
-HANDED_OUT = 30  # frames per second, stored
+STORED_RATE = 30  # frames per second, stored
 GAIN_SPREAD, EXPRESSIVITY, INTENSITY = 0.18, (0.85, 1.15), (0.75, 1.1)
 ASYMMETRY_SPREAD, TAKE_SPREAD = 0.08, 0.05
 
@@ -202,12 +202,12 @@ def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Perfor
     hold, fall, rest_after = rng.integers(12, 36), rng.integers(20, 46), rng.integers(4, 10)
     marks = np.cumsum([rest_before, rise, hold, fall])
     total = int(np.clip(marks[-1] + rest_after, 60, 140))
-    time = np.arange(0, total, RATE // HANDED_OUT, dtype=np.float64)
+    time = np.arange(0, total, RATE // STORED_RATE, dtype=np.float64)
     up = _activation(time, marks[0], rise, len(apex), rng)
     down = _activation(time, marks[2], fall, len(apex), rng)
     share = up * (1 - down)
     weights = apex * share * (1 + _tremor(time, len(apex), rng))
-    frames = [round(m * HANDED_OUT / RATE) for m in marks]
+    frames = [round(m * STORED_RATE / RATE) for m in marks]
     head = _lean(label, rng) * np.clip(share.mean(axis=1, keepdims=True), 0, None)
     return Performance(weights.astype(np.float32), head.astype(np.float32), *frames, duration=total / RATE)
 

@@ -86,12 +86,12 @@ def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
     active = saturate(weights) if rig.level >= 1 else weights
     moved = rig.neutral + (active @ rig.units.reshape(count, -1)).reshape(-1, vertices, 3)
     if rig.contact is not None:
-        moved = contact.keep_off_teeth(rig.contact, moved)
+        moved = contact.clear_teeth(rig.contact, moved)
     if rig.level >= 1:
         # The jaw opens by angle, in proportion to the unsaturated weight: its path is an arc, not a chord.
         moved = _rotate_jaw(rig, moved, weights[:, unit_names().index("jawOpen")])
     if rig.contact is not None:
-        moved = contact.part_lips(rig.contact, contact.slide_lids(rig.contact, moved))
+        moved = contact.separate_lips(rig.contact, contact.slide_lids(rig.contact, moved))
     if rig.skin is not None:
         moved = skin.fold(rig.skin, moved)
     return moved
@@ -148,8 +148,8 @@ def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     """
     loaded = assets.load()
     n = loaded.skin
-    source, _ = deformation_transfer.gradient(makehuman.template().vertices.astype(np.float64), loaded.faces)
-    target, areas = deformation_transfer.gradient(neutral[:n], loaded.faces)
+    source, _ = deformation_transfer.gradient_operator(makehuman.template().vertices.astype(np.float64), loaded.faces)
+    target, areas = deformation_transfer.gradient_operator(neutral[:n], loaded.faces)
     weight = sparse.diags(np.repeat(areas, 3))
     offsets = np.moveaxis(units[:, :n], 1, 0).reshape(n, -1)
     still = np.abs(offsets).max(axis=1) < 1e-6

@@ -48,7 +48,7 @@ class Dictionary(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="steps")
-def code(atoms: jax.Array, x: jax.Array, *, l1: float = L1, l2: float = L2, steps: int = 200) -> jax.Array:
+def sparse_code(atoms: jax.Array, x: jax.Array, *, l1: float = L1, l2: float = L2, steps: int = 200) -> jax.Array:
     """Elastic-net codes (B, k) of rows x (B, D) in atoms (k, D), by accelerated proximal gradients."""
     gram, seen = atoms @ atoms.T, x @ atoms.T
     # The steepest curvature; the problem is divided by it, so that a step of 1 is safe and needs no line search, which
@@ -86,7 +86,7 @@ def _learn(
         order = rng.permutation(len(y))
         for low in range(0, len(y), BATCH):
             batch = jnp.asarray(y[order[low : low + BATCH]])
-            atoms_now, codes = _update(atoms_now, codes, batch, code(atoms_now, batch, l1=l1, l2=l2))
+            atoms_now, codes = _update(atoms_now, codes, batch, sparse_code(atoms_now, batch, l1=l1, l2=l2))
     learned = np.asarray(atoms_now, np.float64)
     at_landmarks = learned.reshape(len(learned), -1, 3)[:, np.asarray(landmark_index)].reshape(len(learned), -1)
     return Dictionary(means[0].reshape(shapes[0]), means[1].reshape(shapes[1]), learned, at_landmarks)
@@ -106,7 +106,7 @@ def _update(atoms: jax.Array, books, x: jax.Array, codes: jax.Array):
     return jax.lax.fori_loop(0, len(atoms), move, atoms), (among, with_x)
 
 
-def _solve(learned: Dictionary, *, alpha: float) -> linear.Params:
+def _solve(learned: Dictionary, *, alpha: float) -> linear.LinearMap:
     """Codes (Y^T Y + alpha I)^-1 Y^T x of the landmarks, with alpha in mm^2 per squared unit of a code."""
     linear.check_alpha(alpha)
     y = learned.landmarks.T

@@ -5,7 +5,7 @@ faces showed and of a smooth prior (Luthi et al. 2018), which takes up what they
 as far as it usually moves. The most probable displacement given the landmarks', with noise of variance `noise`, is one
 affine map; it differs from face to face where the covariance was learnt on a mean face and is *carried* to the given
 one by deformation transfer (`facejax.mesh.transfer`). Plain, and without the smooth prior, it is ridge regression.
-Landmarks that are off, a detector's say, mislead it badly; it can be `told` how far, or find out (`noise_of`).
+Landmarks that are off, a detector's say, mislead it badly; it can be `with_landmark_noise` how far, or find out (`estimate_landmark_noise`).
 
     params = gpmm.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
     mine = gpmm.on_face(params, neutral)  # once per face, a fifth of a second
@@ -29,7 +29,7 @@ from facejax.models.decoders import linear
 
 COMPONENTS = 400
 SCALES = (10.0, 20.0, 40.0, 80.0)  # mm, of the smooth prior: wrinkles of a cheek, a cheek, a jaw, a head
-DOUBTS = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # mm, of landmarks: a sixteenth from one to the next
+NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # mm, of landmarks: a sixteenth from one to the next
 
 
 class Person(NamedTuple):
@@ -48,7 +48,7 @@ class Prior(NamedTuple):
     noise: float = 1e-4  # variance of a landmark's coordinate, mm^2
 
 
-class Params(NamedTuple):
+class GPMM(NamedTuple):
     """The mean face, and what displacements look like on it."""
 
     faces: np.ndarray  # (F, 3)
@@ -57,7 +57,7 @@ class Params(NamedTuple):
     motion: np.ndarray  # (N,) how far each vertex moves, root mean square in mm: the smooth prior's measure
     hold: np.ndarray  # (N,) the same, as the carrier between faces was given it
     # Carried: a basis on the mean face. Plain: moments as they are, or the map itself, the same for all faces.
-    statistics: linear.Basis | linear.Moments | linear.Params
+    statistics: linear.Basis | linear.Moments | linear.LinearMap
     prior: Prior
 
 
@@ -69,17 +69,17 @@ def fit(
     prior: Prior = Prior(),
     components: int = COMPONENTS,
     passes: int = 3,
-) -> Params:
+) -> GPMM:
     """Learn from people (any iterable that can be gone through several times)."""
-    face, motion = survey(people)
-    known = learn(
-        [(p.landmarks, carry_to(p, faces, face, motion) if prior.carried else p.vertices) for p in people],
+    face, motion = mean_face_and_motion(people)
+    known = fit_statistics(
+        [(p.landmarks, transfer_to(p, faces, face, motion) if prior.carried else p.vertices) for p in people],
         carried=prior.carried, components=components, passes=passes,
     )  # fmt: skip
-    return Params(faces, landmark_index, face, motion, motion, known, prior)
+    return GPMM(faces, landmark_index, face, motion, motion, known, prior)
 
 
-def survey(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarray]:
+def mean_face_and_motion(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarray]:
     """The mean face (N, 3), and how far its vertices move (N,), root mean square over all frames in mm."""
     count, faces, frames, squares = 0, 0.0, 0, 0.0
     for person in people:
@@ -91,7 +91,7 @@ def survey(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarray]:
     return faces / count, np.sqrt(squares / frames)
 
 
-def learn(
+def fit_statistics(
     batches: linear.Batches, *, carried: bool, components: int = COMPONENTS, passes: int = 3
 ) -> linear.Basis | linear.Moments:
     """The statistics of displacements: a basis of what was carried to the mean face, or moments of what was not."""
@@ -100,49 +100,49 @@ def learn(
     )
 
 
-def carry_to(person: Person, faces: np.ndarray, face: np.ndarray, hold: np.ndarray) -> np.ndarray:
+def transfer_to(person: Person, faces: np.ndarray, face: np.ndarray, hold: np.ndarray) -> np.ndarray:
     """A person's displacements on another face, (T, N, 3) float32."""
-    there = deformation_transfer.Carrier(person.neutral, face, faces, hold)
-    back = deformation_transfer.Carrier(face, person.neutral, faces, hold)
-    return deformation_transfer.settle(there, back, person.vertices).astype(np.float32)
+    there = deformation_transfer.DeformationTransfer(person.neutral, face, faces, hold)
+    back = deformation_transfer.DeformationTransfer(face, person.neutral, faces, hold)
+    return deformation_transfer.invert(there, back, person.vertices).astype(np.float32)
 
 
-def told(params: Params, noise: float) -> Params:
+def with_landmark_noise(params: GPMM, noise: float) -> GPMM:
     """The model that knows landmarks to be off by so many mm in every coordinate, as a detector's are.
 
     Raises `ValueError` for noise below 0, and for a model of which only the map was kept.
     """
     if not noise >= 0:
         raise ValueError(f"noise: expected 0 mm or more, got {noise}")
-    if noise and isinstance(params.statistics, linear.Params):
+    if noise and isinstance(params.statistics, linear.LinearMap):
         raise ValueError("noise: this model was kept as one map, which was made for landmarks that are right")
     return params._replace(prior=params.prior._replace(noise=params.prior.noise + noise**2))
 
 
-def noise_of(params: Params, neutral: np.ndarray, landmarks: np.ndarray) -> float:
+def estimate_landmark_noise(params: GPMM, neutral: np.ndarray, landmarks: np.ndarray) -> float:
     """How far landmark displacements (T, L, 3) of one face (N, 3) are off, by the model: mm in every coordinate.
 
     The noise under which they are most likely (type II maximum likelihood): what no face does is noise. One number for
-    all frames, of `DOUBTS`, 5 mm at most. Raises `ValueError` as `on_face` and `told` do, for no frames, and for
+    all frames, of `NOISE_GRID_MM`, 5 mm at most. Raises `ValueError` as `linear_map` and `with_landmark_noise` do, for no frames, and for
     landmarks that are not finite.
     """
     if len(landmarks) == 0 or not np.isfinite(landmarks).all():
         raise ValueError(f"landmarks: expected one or more frames of finite numbers, got {np.shape(landmarks)}")
-    if isinstance(params.statistics, linear.Params):
+    if isinstance(params.statistics, linear.LinearMap):
         raise ValueError("noise: this model was kept as one map, which cannot tell what faces do not do")
     known = covariances(params, neutral, only=np.zeros(0, int))
     here, _ = _posterior(known, params.prior)
     variance, directions = np.linalg.eigh(here)
     off = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
     seen = np.mean(np.square(off @ directions), axis=0)
-    whole = np.maximum(variance, params.prior.noise) + np.square(DOUBTS)[:, None]
+    whole = np.maximum(variance, params.prior.noise) + np.square(NOISE_GRID_MM)[:, None]
     likelihood = -np.sum(np.log(whole) + seen / whole, axis=1)
-    return float(DOUBTS[np.argmax(likelihood)])
+    return float(NOISE_GRID_MM[np.argmax(likelihood)])
 
 
-def on_face(params: Params, neutral: np.ndarray) -> linear.Params:
+def linear_map(params: GPMM, neutral: np.ndarray) -> linear.LinearMap:
     """The map of one face (N, 3): what `linear.apply` takes. Raises `ValueError` for a face of another shape."""
-    if isinstance(params.statistics, linear.Params):
+    if isinstance(params.statistics, linear.LinearMap):
         _check(params, neutral)
         return params.statistics
     here, there = _posterior(known := covariances(params, neutral), params.prior)
@@ -160,7 +160,7 @@ class Covariances(NamedTuple):
     smooth_cross: np.ndarray  # (3 L, 3 V)
 
 
-def covariances(params: Params, neutral: np.ndarray, *, only: np.ndarray | None = None) -> Covariances:
+def covariances(params: GPMM, neutral: np.ndarray, *, only: np.ndarray | None = None) -> Covariances:
     """Of one face (N, 3): all vertices, or `only` (V,). Raises `ValueError` for a face of another shape."""
     _check(params, neutral)
     at = params.landmark_index
@@ -171,14 +171,14 @@ def covariances(params: Params, neutral: np.ndarray, *, only: np.ndarray | None 
     return Covariances(mean[keep], mean[at], within, cross, *spread)
 
 
-def answer(known: Covariances, prior: Prior, landmarks: np.ndarray) -> np.ndarray:
+def predict(known: Covariances, prior: Prior, landmarks: np.ndarray) -> np.ndarray:
     """Displacements (T, V, 3) of landmarks' (T, L, 3): for a few frames cheaper than a map."""
     here, there = _posterior(known, prior)
     off = (landmarks - known.landmark_mean).reshape(len(landmarks), -1)
     return known.mean + (np.linalg.solve(here, off.T).T @ there).reshape(len(landmarks), -1, 3)
 
 
-def _check(params: Params, neutral: np.ndarray) -> None:
+def _check(params: GPMM, neutral: np.ndarray) -> None:
     if np.shape(neutral) != params.face.shape:
         raise ValueError(f"neutral: expected vertices {params.face.shape}, got {np.shape(neutral)}")
 
@@ -189,13 +189,13 @@ def _posterior(known: Covariances, prior: Prior) -> tuple[np.ndarray, np.ndarray
     return here, known.cross + far * known.smooth_cross
 
 
-def _learnt(params: Params, neutral: np.ndarray, keep: np.ndarray):
+def _learnt(params: GPMM, neutral: np.ndarray, keep: np.ndarray):
     """On this face: the mean (N, 3), the landmarks' covariance among themselves, and with the kept vertices."""
     known, at = params.statistics, params.landmark_index
     if isinstance(known, linear.Moments):
         cross = known.cross.reshape(len(known.cross), -1, 3)[:, keep].reshape(len(known.cross), -1)
         return known.vertex_mean, known.covariance, cross
-    carrier = deformation_transfer.Carrier(params.face, neutral, params.faces, params.hold)
+    carrier = deformation_transfer.DeformationTransfer(params.face, neutral, params.faces, params.hold)
     shape = (len(known.components), *params.face.shape)
     moved = carrier(np.concatenate([known.vertex_mean[None], known.components.reshape(shape)]))
     mean, moved = moved[0], moved[1:]
@@ -204,7 +204,7 @@ def _learnt(params: Params, neutral: np.ndarray, keep: np.ndarray):
     return mean, weighted.T @ marks, weighted.T @ moved[:, keep].reshape(len(moved), -1)
 
 
-def _smooth(params: Params) -> np.ndarray:
+def _smooth(params: GPMM) -> np.ndarray:
     """The smooth prior's covariance of landmarks and vertices, (L, N), for a standard deviation of one motion."""
     at = params.landmark_index
     squared = np.sum((params.face[at, None] - params.face) ** 2, axis=-1)

@@ -25,26 +25,31 @@ from facejax.models.decoders import gpmm, linear, residual
 BATCH = 16
 FACES = 8  # remembered
 # What was asked for last: the model and its map of a face, by the model's identity, the face's bytes and the noise.
-_prepared: OrderedDict[tuple[int, str, float], tuple[gpmm.Params, linear.Params]] = OrderedDict()
+_prepared: OrderedDict[tuple[int, str, float], tuple[gpmm.GPMM, linear.LinearMap]] = OrderedDict()
 
 
-class Params(NamedTuple):
+class GPMMResidual(NamedTuple):
     """The linear answer, the network that refines it, and the tables that it works on."""
 
-    base: gpmm.Params
-    network: residual.Params
+    base: gpmm.GPMM
+    network: residual.ResidualDecoder
     hierarchy: Hierarchy
-    tables: strain.Around
+    tables: strain.VertexTriangles
 
 
 def apply(
-    params: Params, displacements: jax.Array, neutral: np.ndarray, *, refined: bool = True, noise: float | None = 0.0
+    params: GPMMResidual,
+    displacements: jax.Array,
+    neutral: np.ndarray,
+    *,
+    refined: bool = True,
+    noise: float | None = 0.0,
 ) -> jax.Array:
     """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
 
     Without `refined` the linear answer alone, which is one product of matrices. `noise` tells by how many mm the
     landmarks are off in every coordinate, such as those of a detector; None finds it out from the frames given
-    (`gpmm.noise_of`). The linear answer takes it into account, and goes unrefined, since the network has learnt from
+    (`gpmm.estimate_landmark_noise`). The linear answer takes it into account, and goes unrefined, since the network has learnt from
     landmarks that are right.
 
     Raises `ValueError` for other shapes, for a face that is traced (each is prepared on the host), and for `noise`
@@ -57,8 +62,8 @@ def apply(
     neutral = np.asarray(neutral)
     if noise is None:
         marks = np.asarray(displacements)
-        noise = gpmm.noise_of(params.base, neutral, marks.reshape(-1, *marks.shape[-2:]))
-    base = linear.apply(on_face(params.base, neutral, noise), jnp.asarray(displacements))
+        noise = gpmm.estimate_landmark_noise(params.base, neutral, marks.reshape(-1, *marks.shape[-2:]))
+    base = linear.apply(cached_linear_map(params.base, neutral, noise), jnp.asarray(displacements))
     if noise or not refined:
         return base
     lead = base.shape[:-2]
@@ -68,19 +73,19 @@ def apply(
     return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
 
 
-def on_face(base: gpmm.Params, neutral: np.ndarray, noise: float = 0.0) -> linear.Params:
-    """`gpmm.on_face` of a model that is `gpmm.told` of landmark noise in mm, remembered."""
+def cached_linear_map(base: gpmm.GPMM, neutral: np.ndarray, noise: float = 0.0) -> linear.LinearMap:
+    """`gpmm.linear_map` of a model that is `gpmm.with_landmark_noise` of landmark noise in mm, remembered."""
     key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest(), noise
     if key not in _prepared:
         # The model is kept with its answer: no other can then have its identity.
-        _prepared[key] = base, gpmm.on_face(gpmm.told(base, noise), neutral)
+        _prepared[key] = base, gpmm.linear_map(gpmm.with_landmark_noise(base, noise), neutral)
         while len(_prepared) > FACES:
             _prepared.popitem(last=False)
     _prepared.move_to_end(key)
     return _prepared[key][1]
 
 
-def refine(params: Params, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:
+def refine(params: GPMMResidual, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:
     """The base's answers (B, N, 3) to landmarks (B, L, 3) of faces (B, N, 3), refined."""
     if len(base) == 0 or float(params.network.gate) == 0:
         return base
@@ -101,7 +106,7 @@ def _refine(network, hierarchy, tables, displacements, base, neutral):
     return found.reshape(-1, *found.shape[2:])[:count]
 
 
-def pack(params: Params, *, components: int | None = None) -> dict[str, Any]:
+def pack(params: GPMMResidual, *, components: int | None = None) -> dict[str, Any]:
     """A tree of arrays for a file.
 
     Of a carried model the widest `components`, in half precision, an error of some 0.0005 mm. Of a plain one the map
@@ -118,13 +123,13 @@ def pack(params: Params, *, components: int | None = None) -> dict[str, Any]:
         tree["components"] = np.asarray(known.components[some], np.float16)
         tree["variance"] = np.asarray(known.variance[some], np.float32)
     else:
-        found = gpmm.on_face(base, base.face)
+        found = gpmm.linear_map(base, base.face)
         (tree["map"],) = found.factors
         tree |= {"mean": found.vertex_mean, "landmark_mean": found.landmark_mean}
     return {"base": tree, "network": params.network._asdict()}
 
 
-def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: np.ndarray) -> Params:
+def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: np.ndarray) -> GPMMResidual:
     """What `pack` was given, on the triangles (F, 3). Raises `KeyError` for a tree that is none of its own."""
     base = dict(tree["base"])
     at, prior = np.asarray(base["landmark_index"]), np.asarray(base["prior"])
@@ -140,13 +145,13 @@ def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: np.ndarray) -> Par
     prior = gpmm.Prior(bool(prior[0]), float(prior[1]), float(prior[2]))
     face, motion, hold = (wide(base[name]) for name in ("face", "motion", "hold"))
     faces = np.asarray(faces)
-    found = gpmm.Params(faces, at, face, motion, hold, known, prior)
+    found = gpmm.GPMM(faces, at, face, motion, hold, known, prior)
     # As `pack` leaves it, or all names, as a file does.
     scale, network = tree["network"]["scale"], tree["network"]
     scale = residual.Scale(**scale) if isinstance(scale, dict) else scale
-    return Params(
+    return GPMMResidual(
         found,
-        jax.tree.map(jnp.asarray, residual.Params(scale, network["weights"], network["gate"])),
+        jax.tree.map(jnp.asarray, residual.ResidualDecoder(scale, network["weights"], network["gate"])),
         jax.device_put(hierarchy),
-        jax.device_put(strain.around(faces, len(face))),
+        jax.device_put(strain.vertex_triangles(faces, len(face))),
     )

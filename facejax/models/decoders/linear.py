@@ -24,7 +24,7 @@ import numpy as np
 Batches = Iterable[tuple[np.ndarray, np.ndarray]]
 
 
-class Params(NamedTuple):
+class LinearMap(NamedTuple):
     """vertex_mean + (x - landmark_mean) @ factors[0] @ factors[1] ..., over flattened coordinates."""
 
     landmark_mean: jax.Array  # (L, 3)
@@ -35,9 +35,9 @@ class Params(NamedTuple):
 class Model(NamedTuple):
     """`fit(batches, *, alpha, **options)` is `solve(prepare(batches, **options), alpha=alpha)`."""
 
-    fit: Callable[..., Params]
+    fit: Callable[..., LinearMap]
     prepare: Callable[..., Any]
-    solve: Callable[..., Params]
+    solve: Callable[..., LinearMap]
 
 
 class Moments(NamedTuple):
@@ -61,7 +61,7 @@ class Basis(NamedTuple):
 
 
 @jax.jit
-def apply(params: Params, landmarks: jax.Array) -> jax.Array:
+def apply(params: LinearMap, landmarks: jax.Array) -> jax.Array:
     """Vertex displacements (..., N, 3) from landmark displacements (..., L, 3), in mm."""
     expected = params.landmark_mean.shape
     if landmarks.shape[-2:] != expected:
@@ -73,9 +73,9 @@ def apply(params: Params, landmarks: jax.Array) -> jax.Array:
     return params.vertex_mean + x.reshape(*x.shape[:-1], *params.vertex_mean.shape)
 
 
-def affine(landmark_mean: np.ndarray, vertex_mean: np.ndarray, *factors: np.ndarray) -> Params:
+def affine(landmark_mean: np.ndarray, vertex_mean: np.ndarray, *factors: np.ndarray) -> LinearMap:
     """Parameters in float32 from means (L, 3), (N, 3) and one or more factors whose product is (3 L, 3 N)."""
-    return Params(
+    return LinearMap(
         jnp.asarray(landmark_mean, jnp.float32),
         jnp.asarray(vertex_mean, jnp.float32),
         tuple(jnp.asarray(factor, jnp.float32) for factor in factors),
@@ -104,7 +104,7 @@ def choose(
 
 
 @jax.jit
-def _distances(params: Params, landmarks: jax.Array, vertices: jax.Array) -> jax.Array:
+def _distances(params: LinearMap, landmarks: jax.Array, vertices: jax.Array) -> jax.Array:
     """Distance of each vertex, summed over it: (B,)."""
     off = apply(params, landmarks) - vertices
     return jnp.sum(jnp.sqrt(jnp.sum(off * off, axis=-1)), axis=-1)
@@ -134,7 +134,7 @@ def _moments(batches: Batches) -> Moments:
     )
 
 
-def _solve_ridge(moments: Moments, *, alpha: float) -> Params:
+def _solve_ridge(moments: Moments, *, alpha: float) -> LinearMap:
     """(covariance + alpha I) W = cross, with alpha in mm^2."""
     check_alpha(alpha)
     penalised = moments.covariance + alpha * np.eye(len(moments.covariance))
@@ -205,7 +205,7 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
     return columns
 
 
-def _solve_pca(basis: Basis, *, alpha: float) -> Params:
+def _solve_pca(basis: Basis, *, alpha: float) -> LinearMap:
     """Coefficients (Y^T Y + alpha diag(1 / variance))^-1 Y^T x: most probable under noise of variance alpha."""
     check_alpha(alpha)
     y = basis.landmarks.T
@@ -217,7 +217,7 @@ def _solve_pca(basis: Basis, *, alpha: float) -> Params:
 def model(prepare: Callable, solve: Callable) -> Model:
     """A model from its two halves, `prepare(batches, **options)` and `solve(prepared, *, alpha)`."""
 
-    def fit(batches: Batches, *, alpha: float, **options) -> Params:
+    def fit(batches: Batches, *, alpha: float, **options) -> LinearMap:
         """Fit to batches with regularisation `alpha` in mm^2."""
         return solve(prepare(batches, **options), alpha=alpha)
 

@@ -35,14 +35,14 @@ class Scale(NamedTuple):
     landmark_std: jax.Array  # ()
 
 
-class Params(NamedTuple):
+class Neural3DMM(NamedTuple):
     """The constants, and the weights that are trained."""
 
     scale: Scale
     weights: dict[str, Any]
 
 
-def descents(hierarchy: Hierarchy) -> tuple[Stencil, ...]:
+def downsampling_spirals(hierarchy: Hierarchy) -> tuple[Stencil, ...]:
     """The spirals of those vertices alone that the next level keeps, level by level from fine to coarse."""
     found = []
     for level, spirals in enumerate(hierarchy.spirals):
@@ -60,7 +60,7 @@ def init(
     *,
     encoder: Sequence[int] = ENCODER,
     channels: Sequence[int] = s2d_dec.CHANNELS,
-) -> Params:
+) -> Neural3DMM:
     """Random weights. Raises `ValueError` where the numbers of levels do not fit."""
     if len(encoder) != len(hierarchy.climbs):
         raise ValueError(f"encoder: expected {len(hierarchy.climbs)} channels for this hierarchy, got {len(encoder)}")
@@ -75,12 +75,12 @@ def init(
     decode = s2d_dec.init_weights(
         decode_key, hierarchy, inputs=LATENT + scale.landmark_mean.size, channels=channels, outputs=3
     )
-    return Params(scale, {"encoder": convs, "latent": latent, "decoder": decode})
+    return Neural3DMM(scale, {"encoder": convs, "latent": latent, "decoder": decode})
 
 
 @jax.jit
 def apply(
-    params: Params, hierarchy: Hierarchy, down: tuple[Stencil, ...], displacements: jax.Array, neutral: jax.Array
+    params: Neural3DMM, hierarchy: Hierarchy, down: tuple[Stencil, ...], displacements: jax.Array, neutral: jax.Array
 ) -> jax.Array:
     """Positions (B, N, 3) of the vertices from landmark displacements (B, L, 3) and neutral faces (B, N, 3).
 
@@ -95,12 +95,12 @@ def apply(
         )
     latent = encode(params, down, neutral)
     moved = (displacements - scale.landmark_mean).reshape(len(displacements), -1) / scale.landmark_std
-    found = s2d_dec.expand(weights["decoder"], hierarchy, jnp.concatenate([latent, moved], axis=-1))
+    found = s2d_dec.decode(weights["decoder"], hierarchy, jnp.concatenate([latent, moved], axis=-1))
     return scale.face + scale.face_std * found.transpose(1, 0, 2)
 
 
 @jax.jit
-def encode(params: Params, down: tuple[Stencil, ...], neutral: jax.Array) -> jax.Array:
+def encode(params: Neural3DMM, down: tuple[Stencil, ...], neutral: jax.Array) -> jax.Array:
     """The latent code (B, 16) of neutral faces (B, N, 3)."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = ((neutral - scale.face) / scale.face_std).transpose(1, 0, 2)

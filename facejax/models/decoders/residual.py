@@ -41,7 +41,7 @@ class Scale(NamedTuple):
     unit: jax.Array  # () root mean square of what the base leaves over, per coordinate
 
 
-class Params(NamedTuple):
+class ResidualDecoder(NamedTuple):
     """The constants, the weights that are trained, and how much of the network's answer to take."""
 
     scale: Scale
@@ -51,7 +51,7 @@ class Params(NamedTuple):
 
 def init(
     key: jax.Array, hierarchy: Hierarchy, scale: Scale, *, channels: Sequence[int] = CHANNELS, mixed: int = MIXED
-) -> Params:
+) -> ResidualDecoder:
     """Weights that answer zero."""
     climb_key, own_key, *mix_keys = jax.random.split(key, 4)
     vertices, spiral = hierarchy.sizes[0], len(hierarchy.surface.source)
@@ -69,14 +69,14 @@ def init(
         "readout": jnp.zeros((vertices, mixed, 3)),
         "shared": jnp.zeros((mixed, 3)),
     }
-    return Params(scale, weights, jnp.ones(()))
+    return ResidualDecoder(scale, weights, jnp.ones(()))
 
 
 @jax.jit
 def apply(
-    params: Params,
+    params: ResidualDecoder,
     hierarchy: Hierarchy,
-    tables: strain.Around,
+    tables: strain.VertexTriangles,
     displacements: jax.Array,
     base: jax.Array,
     neutral: jax.Array,
@@ -93,7 +93,7 @@ def apply(
     place = (rest - scale.face[:, None]) / PLACE
     own = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], OWN))
     x = (displacements - scale.landmark_mean).reshape(len(base), -1) / scale.landmark_std
-    climbed = s2d_dec.climb(weights["climb"], hierarchy, x)
+    climbed = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
     x = jnp.concatenate([stretch / STRAIN, moved / MOVED, normal, place, own, climbed], axis=-1)
     first, second = weights["mix"]
     x = jax.nn.elu(spiral_conv.spiral_conv(x, first["kernel"], hierarchy.surface) + first["bias"])

@@ -32,7 +32,7 @@ class Scale(NamedTuple):
     vertex_std: jax.Array  # ()
 
 
-class Params(NamedTuple):
+class S2DDec(NamedTuple):
     """The constants, and the weights that are trained."""
 
     scale: Scale
@@ -46,7 +46,7 @@ def init(
     landmarks: int = 68,
     channels: Sequence[int] = CHANNELS,
     scale: Scale | None = None,
-) -> Params:
+) -> S2DDec:
     """Random weights that start within a hundredth of the mean displacement.
 
     `channels` from the coarsest level's signal to the finest: one more than the hierarchy has
@@ -57,13 +57,13 @@ def init(
     weights["convs"][-1]["kernel"] *= 0.01
     if scale is None:
         scale = Scale(jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.zeros((hierarchy.sizes[0], 3)), jnp.ones(()))
-    return Params(scale, weights)
+    return S2DDec(scale, weights)
 
 
 def init_weights(
     key: jax.Array, hierarchy: Hierarchy, *, inputs: int, channels: Sequence[int], outputs: int | None
 ) -> Weights:
-    """Random weights of `expand`, from `inputs` numbers to `outputs` per vertex; without outputs, of `climb`.
+    """Random weights of `decode`, from `inputs` numbers to `outputs` per vertex; without outputs, of `decode_levels`.
 
     `channels` as in `init`. Raises `ValueError` where the numbers of levels do not fit.
     """
@@ -84,14 +84,16 @@ def init_weights(
     return {"dense": {"kernel": glorot(dense_key, (inputs, coarse)), "bias": jnp.zeros(coarse)}, "convs": convs}
 
 
-def expand(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
+def decode(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
     """A batch of vectors (B, inputs) -> a signal on the finest level (N, B, outputs), the batch inside."""
     last = weights["convs"][-1]
-    return spiral_conv.spiral_conv(climb(weights, hierarchy, x), last["kernel"], hierarchy.surface) + last["bias"]
+    return (
+        spiral_conv.spiral_conv(decode_levels(weights, hierarchy, x), last["kernel"], hierarchy.surface) + last["bias"]
+    )
 
 
-def climb(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
-    """`expand` but for its last convolution: (B, inputs) -> (N, B, channels[-1])."""
+def decode_levels(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
+    """`decode` but for its last convolution: (B, inputs) -> (N, B, channels[-1])."""
     x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
     climbs = hierarchy.climbs[::-1]
     convs = weights["convs"][: len(climbs)]
@@ -103,7 +105,7 @@ def climb(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames="chunk")
-def apply(params: Params, hierarchy: Hierarchy, displacements: jax.Array, *, chunk: int | None = None) -> jax.Array:
+def apply(params: S2DDec, hierarchy: Hierarchy, displacements: jax.Array, *, chunk: int | None = None) -> jax.Array:
     """Vertex displacements (..., N, 3) in mm from landmark displacements (..., L, 3) in mm.
 
     Give whole batches: leading axes are free, and a batch is much faster than a vmap of single samples.
@@ -141,11 +143,11 @@ def measure(batches: Iterable[tuple[np.ndarray, np.ndarray]]) -> Scale:
     return Scale(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
 
 
-def _decode(params: Params, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
+def _decode(params: S2DDec, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
     """A chunk (B, 3 L) -> (B, N, 3)."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = (displacements - scale.landmark_mean.reshape(-1)) / scale.landmark_std
-    x = expand(weights, hierarchy, x)
+    x = decode(weights, hierarchy, x)
     return scale.vertex_mean + scale.vertex_std * x.transpose(1, 0, 2)
 
 

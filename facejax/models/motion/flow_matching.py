@@ -24,7 +24,7 @@ import jax.numpy as jnp
 
 from facejax.geometry import sphere
 from facejax.models.motion import tangent_pca
-from facejax.models.motion.tangent_pca import Chart, Motion
+from facejax.models.motion.tangent_pca import Motion, TangentPCA
 
 Weights = dict[str, Any]
 State = tuple[jax.Array, jax.Array]
@@ -48,14 +48,14 @@ class Config(NamedTuple):
 DEFAULT = Config()
 
 
-class Params(NamedTuple):
+class FlowMatching(NamedTuple):
     """The chart that the field lives in, and the weights that are trained."""
 
-    chart: Chart
+    chart: TangentPCA
     weights: Weights
 
 
-def init(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+def init(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> FlowMatching:
     """A field that is zero everywhere."""
     sizes = (config.rank, config.steps, config.landmarks, 3), (config.labels, config.labels, config.rank), config.pose
     found = chart.basis.shape, chart.mean.shape, len(chart.pose_scale)
@@ -72,17 +72,17 @@ def init(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
         "gates": [_zeros(context, config.width) for _ in keys[config.blocks :]],
         "head": _zeros(config.width, config.rank + 1 + tangent_pca.SCALARS),
     }
-    return Params(chart, weights)
+    return FlowMatching(chart, weights)
 
 
 @jax.jit
-def velocity(params: Params, state: State, time: jax.Array, start, end, pose: jax.Array) -> State:
+def velocity(params: FlowMatching, state: State, time: jax.Array, start, end, pose: jax.Array) -> State:
     """The field at a state and a time (): a tangent vector at y (1, 1, R + 1), and the rate of s (2,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     y, s = state
     scale = unit(chart, start, end)
     context = jnp.concatenate([_waves(time), weights["labels"][0, start], weights["labels"][1, end], pose])
-    centre = wrap(chart, tangent_pca.expected(chart, start, end, pose))[0]
+    centre = to_state(chart, tangent_pca.conditional_mean(chart, start, end, pose))[0]
     offset = (y - centre)[0, 0] / scale
     # Near the mean in units of its spread, and as it is: the first saturates where a motion is far from its pair.
     hidden = jnp.concatenate([jnp.tanh(offset / 4) * 4, y[0, 0] * jnp.sqrt(len(scale)), s, context])
@@ -95,14 +95,17 @@ def velocity(params: Params, state: State, time: jax.Array, start, end, pose: ja
 
 
 @jax.jit
-def source(chart: Chart, key: jax.Array, start, end, pose: jax.Array) -> State:
+def sample_source(chart: TangentPCA, key: jax.Array, start, end, pose: jax.Array) -> State:
     """Draw where the flow begins: the Gaussian of a pair and a pose, wrapped on the sphere."""
     noise = jax.random.normal(key, (tangent_pca.SCALARS + len(chart.basis),))
-    return wrap(chart, tangent_pca.expected(chart, start, end, pose) + tangent_pca.unit(chart, start, end) * noise)
+    return to_state(
+        chart,
+        tangent_pca.conditional_mean(chart, start, end, pose) + tangent_pca.conditional_std(chart, start, end) * noise,
+    )
 
 
 @jax.jit
-def wrap(chart: Chart, values: jax.Array) -> State:
+def to_state(chart: TangentPCA, values: jax.Array) -> State:
     """Coordinates (2 + R,) -> the state: exp_p within the great sphere."""
     # The tangent vector's norm on the SRVF sphere is a mean over steps, its components' a sum.
     tangent = jnp.append(0.0, values[tangent_pca.SCALARS :]) / jnp.sqrt(len(chart.p))
@@ -110,7 +113,7 @@ def wrap(chart: Chart, values: jax.Array) -> State:
 
 
 @jax.jit
-def unwrap(chart: Chart, state: State, start, end) -> Motion:
+def from_state(chart: TangentPCA, state: State, start, end) -> Motion:
     """The motion of a state: a point on the SRVF sphere, log-length and log-seconds."""
     y, s = state
     y = (y / sphere.norm(y)[..., None, None, None])[0, 0]
@@ -122,14 +125,14 @@ def unwrap(chart: Chart, state: State, start, end) -> Motion:
 
 
 @partial(jax.jit, static_argnames="steps")
-def sample(params: Params, key: jax.Array, start, end, pose: jax.Array, *, steps: int = STEPS) -> Motion:
+def sample(params: FlowMatching, key: jax.Array, start, end, pose: jax.Array, *, steps: int = STEPS) -> Motion:
     """Draw a motion between two labels that starts at a pose (D,): `steps` midpoint steps along the field.
 
     Raises `ValueError` for fewer than one step.
     """
     if steps < 1:
         raise ValueError(f"steps of integration: expected 1 or more, got {steps}")
-    state = source(params.chart, key, start, end, pose)
+    state = sample_source(params.chart, key, start, end, pose)
 
     def advance(state: State, time: jax.Array) -> tuple[State, None]:
         y, s = state
@@ -141,15 +144,15 @@ def sample(params: Params, key: jax.Array, start, end, pose: jax.Array, *, steps
         return (y / sphere.norm(y)[..., None, None, None], s + rate / steps), None
 
     state, _ = jax.lax.scan(advance, state, jnp.arange(steps) / steps)
-    return unwrap(params.chart, state, start, end)
+    return from_state(params.chart, state, start, end)
 
 
-def _pole(chart: Chart) -> jax.Array:
+def _pole(chart: TangentPCA) -> jax.Array:
     return jnp.zeros((1, 1, len(chart.basis) + 1)).at[0, 0, 0].set(1.0)
 
 
 @jax.jit
-def unit(chart: Chart, start, end) -> jax.Array:
+def unit(chart: TangentPCA, start, end) -> jax.Array:
     """A length for each entry of y (R + 1,): the pair's deviations; their mean along p."""
     scale = chart.scale[start, end] / jnp.sqrt(len(chart.p))
     return jnp.append(jnp.sqrt(jnp.mean(scale**2)), scale)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from facejax.geometry import sphere
 from facejax.models.motion import tangent_pca
-from facejax.models.motion.tangent_pca import Chart, Motion
+from facejax.models.motion.tangent_pca import Motion, TangentPCA
 
 Weights = dict[str, Any]
 
@@ -42,10 +42,10 @@ class Config(NamedTuple):
 DEFAULT = Config()
 
 
-class Params(NamedTuple):
+class Motion3DGAN(NamedTuple):
     """One network: the chart it speaks in, and the weights that are trained."""
 
-    chart: Chart
+    chart: TangentPCA
     weights: Weights
 
 
@@ -57,7 +57,7 @@ class Network(NamedTuple):
     inner: Callable
 
 
-def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+def _init_generator(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
     """A generator that starts as a Gaussian: the right mean and spread of every pair."""
     _check_chart(chart, config)
     stem_key, label_key, blocks_key = jax.random.split(key, 3)
@@ -69,28 +69,33 @@ def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -
         # Each of the widest directions, and length and duration, get a noise of their own.
         "skip": jnp.eye(config.noise, config.rank + tangent_pca.SCALARS),
     }
-    return Params(chart, weights)
+    return Motion3DGAN(chart, weights)
 
 
 @jax.jit
-def _generate_coordinates(params: Params, noise: jax.Array, start, end, pose: jax.Array) -> jax.Array:
+def _generate_coordinates(params: Motion3DGAN, noise: jax.Array, start, end, pose: jax.Array) -> jax.Array:
     """Coordinates (2 + R,) from noise (128,) ~ N(0, 1), two label indices and a pose (D,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     _check_noise(noise, weights)
     hidden = jnp.concatenate([noise, weights["labels"][0, start], weights["labels"][1, end], pose])
     hidden = _residual_stack(weights, hidden, jax.nn.silu)
     deviation = noise @ weights["skip"] + _linear(weights["head"], hidden)
-    return tangent_pca.expected(chart, start, end, pose) + tangent_pca.unit(chart, start, end) * deviation
+    return (
+        tangent_pca.conditional_mean(chart, start, end, pose)
+        + tangent_pca.conditional_std(chart, start, end) * deviation
+    )
 
 
 @jax.jit
-def _generate(params: Params, noise: jax.Array, start, end, pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _generate(
+    params: Motion3DGAN, noise: jax.Array, start, end, pose: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Tangent vector at p (T-1, L, 3), log-length and log-seconds () from noise (128,), two label indices, a pose."""
     values = _generate_coordinates(params, noise, start, end, pose)
-    return tangent_pca.motion(jax.lax.stop_gradient(params.chart), values, start, end)
+    return tangent_pca.decode(jax.lax.stop_gradient(params.chart), values, start, end)
 
 
-def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+def _init_critic(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
     _check_chart(chart, config)
     stem_key, label_key, blocks_key, head_key = jax.random.split(key, 4)
     weights = {
@@ -99,16 +104,16 @@ def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> P
         "blocks": _blocks(blocks_key, config),
         "head": _dense(head_key, config.width, 1),
     }
-    return Params(chart, weights)
+    return Motion3DGAN(chart, weights)
 
 
 @jax.jit
-def _score(params: Params, values: jax.Array, start, end, pose: jax.Array) -> jax.Array:
+def _score(params: Motion3DGAN, values: jax.Array, start, end, pose: jax.Array) -> jax.Array:
     """How real a motion looks, from its coordinates (2 + R,); any real number, larger is more real."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     # Centred, and brought to order one by a single factor: a factor per direction would blow up the gradient
     # along the narrow ones, which the penalty then fights.
-    offset = values - tangent_pca.expected(chart, start, end, pose)
+    offset = values - tangent_pca.conditional_mean(chart, start, end, pose)
     factor = 1 / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
     offset = offset.at[tangent_pca.SCALARS :].multiply(factor)
     hidden = jnp.concatenate([offset, weights["labels"][0, start], weights["labels"][1, end], pose])
@@ -116,10 +121,12 @@ def _score(params: Params, values: jax.Array, start, end, pose: jax.Array) -> ja
 
 
 @jax.jit
-def _criticise(params: Params, tangent: jax.Array, log_length, log_seconds, start, end, pose: jax.Array) -> jax.Array:
+def _criticise(
+    params: Motion3DGAN, tangent: jax.Array, log_length, log_seconds, start, end, pose: jax.Array
+) -> jax.Array:
     """How real a tangent vector at p (T-1, L, 3) with a log-length and log-seconds () looks for labels and pose."""
     chart = jax.lax.stop_gradient(params.chart)
-    values = tangent_pca.coordinates(chart, tangent, log_length, log_seconds, start, end)
+    values = tangent_pca.encode(chart, tangent, log_length, log_seconds, start, end)
     return _score(params, values, start, end, pose)
 
 
@@ -128,7 +135,7 @@ critic = Network(_init_critic, _criticise, _score)
 
 
 @jax.jit
-def sample(params: Params, key: jax.Array, start, end, pose: jax.Array) -> Motion:
+def sample(params: Motion3DGAN, key: jax.Array, start, end, pose: jax.Array) -> Motion:
     """Draw a motion between two labels that starts at a pose (D,)."""
     noise = jax.random.normal(key, params.weights["skip"].shape[:1])
     tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
@@ -159,7 +166,7 @@ def _residual_stack(weights: Weights, x: jax.Array, activation) -> jax.Array:
     return x
 
 
-def _check_chart(chart: Chart, config: Config) -> None:
+def _check_chart(chart: TangentPCA, config: Config) -> None:
     expected = (config.rank, config.steps, config.landmarks, 3)
     means = (config.labels, config.labels, config.rank)
     if chart.basis.shape != expected or chart.mean.shape != means or len(chart.pose_scale) != config.pose:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from facejax.geometry import sphere
-from facejax.models.motion.tangent_pca import Chart, Motion
+from facejax.models.motion.tangent_pca import Motion, TangentPCA
 
 Weights = dict[str, Any]
 
@@ -34,10 +34,10 @@ class Config(NamedTuple):
 DEFAULT = Config()
 
 
-class Params(NamedTuple):
+class Motion3DGANReference(NamedTuple):
     """One network: the chart, of which it uses the point p and the log-lengths, and its weights."""
 
-    chart: Chart
+    chart: TangentPCA
     weights: Weights
 
 
@@ -48,7 +48,7 @@ class Network(NamedTuple):
     apply: Callable
 
 
-def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+def _init_generator(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGANReference:
     stem_key, length_key, *conv_keys = jax.random.split(key, 6)
     condition = 2 * config.labels
     widths = [width // config.width_divisor for width in (1024, 512, 256, 128)] + [1]
@@ -62,11 +62,11 @@ def _init_generator(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -
         ],
         "length": _dense(length_key, widths[3], 1),
     }
-    return Params(chart, weights)
+    return Motion3DGANReference(chart, weights)
 
 
 @jax.jit
-def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, jax.Array]:
+def _generate(params: Motion3DGANReference, noise: jax.Array, start, end) -> tuple[jax.Array, jax.Array]:
     """Tangent vector at p (T-1, L, 3) and log-length () from noise (128,) ~ N(0, 1) and two label indices."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     steps, landmarks, _ = chart.p.shape
@@ -83,7 +83,7 @@ def _generate(params: Params, noise: jax.Array, start, end) -> tuple[jax.Array, 
     return tangent, chart.scalar_mean[start, end, 0] + chart.scalar_std[0] * standard
 
 
-def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> Params:
+def _init_critic(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGANReference:
     *conv_keys, hidden_key, head_key = jax.random.split(key, 5)
     condition = 2 * config.labels
     widths = [width // config.width_divisor for width in (64, 32, 16)]
@@ -95,11 +95,11 @@ def _init_critic(key: jax.Array, chart: Chart, *, config: Config = DEFAULT) -> P
         "hidden": _dense(hidden_key, halved[0] * halved[1] * inputs[-1] + 1, hidden),
         "head": _dense(head_key, hidden, 1),
     }
-    return Params(chart, weights)
+    return Motion3DGANReference(chart, weights)
 
 
 @jax.jit
-def _criticise(params: Params, tangent: jax.Array, log_length: jax.Array, start, end) -> jax.Array:
+def _criticise(params: Motion3DGANReference, tangent: jax.Array, log_length: jax.Array, start, end) -> jax.Array:
     """How real a tangent vector at p (T-1, L, 3) with a log-length () looks for two label indices."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     condition = _one_hots(chart, start, end)
@@ -116,7 +116,7 @@ critic = Network(_init_critic, _criticise)
 
 
 @jax.jit
-def sample(params: Params, key: jax.Array, start, end, pose: jax.Array | None = None) -> Motion:
+def sample(params: Motion3DGANReference, key: jax.Array, start, end, pose: jax.Array | None = None) -> Motion:
     """Draw a motion between two labels. The pose is not heeded, and the duration is the pair's mean."""
     del pose
     noise = jax.random.normal(key, (_noise(params),))
@@ -124,7 +124,7 @@ def sample(params: Params, key: jax.Array, start, end, pose: jax.Array | None = 
     return Motion(sphere.exp(params.chart.p, tangent), log_length, params.chart.scalar_mean[start, end, 1])
 
 
-def _noise(params: Params) -> int:
+def _noise(params: Motion3DGANReference) -> int:
     """The labels enter the first layer twice, as two one-hots each."""
     return params.weights["stem"]["kernel"].shape[0] - 4 * len(params.chart.scalar_mean)
 
@@ -135,7 +135,7 @@ def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:
     return [(low, short), (2 * low, 2 * short), (rows, 4 * short), (rows, columns)]
 
 
-def _one_hots(chart: Chart, start, end) -> jax.Array:
+def _one_hots(chart: TangentPCA, start, end) -> jax.Array:
     labels = len(chart.scalar_mean)
     return jnp.concatenate([jax.nn.one_hot(start, labels), jax.nn.one_hot(end, labels)])
 

@@ -20,7 +20,7 @@ LIMIT = 2.5  # deviations from the mean beyond which no face of a label is taken
 BLUR = 0.4  # deviation of the blur, in units of the label's own deviation
 
 
-class Params(NamedTuple):
+class StartPoses(NamedTuple):
     """Peaks by label; rows beyond a label's count are zero."""
 
     poses: jax.Array  # (K, N, D)
@@ -28,7 +28,7 @@ class Params(NamedTuple):
     root: jax.Array  # (K, D, D), a root of the label's covariance
 
 
-def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> Params:
+def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> StartPoses:
     """From the poses of peaks (M, D) with labels (M,) in 1..classes-1.
 
     Raises `ValueError` where an expression has fewer than two peaks.
@@ -46,11 +46,11 @@ def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> Params:
         table[label, : len(own)] = own
         values, vectors = np.linalg.eigh(np.cov(own.T, bias=True))
         roots[label] = vectors * np.sqrt(np.maximum(values, 0))
-    return Params(*(jnp.asarray(x, jnp.float32) for x in (table, counts, roots)))
+    return StartPoses(*(jnp.asarray(x, jnp.float32) for x in (table, counts, roots)))
 
 
 @jax.jit
-def plausible(params: Params, pose: jax.Array, label) -> jax.Array:
+def clip_to_distribution(params: StartPoses, pose: jax.Array, label) -> jax.Array:
     """The pose (D,) brought to within `LIMIT` deviations along each principal axis of the label's peaks.
 
     A chain of transitions ends each one a little beside a real peak. What lies along axes that the label's peaks do not
@@ -65,7 +65,7 @@ def plausible(params: Params, pose: jax.Array, label) -> jax.Array:
 
 
 @jax.jit
-def sample(params: Params, key: jax.Array, label) -> jax.Array:
+def sample(params: StartPoses, key: jax.Array, label) -> jax.Array:
     """Draw the pose (D,) of a peak; neutral's is zero."""
     which_key, blur_key = jax.random.split(key)
     count = params.count[label]

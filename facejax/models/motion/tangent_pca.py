@@ -33,7 +33,7 @@ class Motion(NamedTuple):
     log_seconds: jax.Array  # (...)
 
 
-class Chart(NamedTuple):
+class TangentPCA(NamedTuple):
     """Constants from the training set, never trained; K labels, R directions, D directions of poses."""
 
     p: jax.Array  # (T-1, L, 3), a point on the sphere
@@ -60,10 +60,10 @@ def fit(
     labels: int,
     rank: int = 128,
     pose: int = 32,
-) -> Chart:
+) -> TangentPCA:
     """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), first frames `here` (M, L, 3).
 
-    Of `motion` the log-length and log-seconds (M,) are read; `start`, `end` are labels (M,) in 0..labels-1.
+    Of `decode` the log-length and log-seconds (M,) are read; `start`, `end` are labels (M,) in 0..labels-1.
     The directions span the R principal ones of all tangent vectors, and are turned within that span so that
     the spread within label pairs is uncorrelated. Pairs without a motion get the sum of a start's and an
     end's effect as mean; pairs with fewer than 8 the spread of all.
@@ -98,18 +98,18 @@ def fit(
     basis = (turn.T @ span).reshape(-1, *shape)
     arrays = p, basis, mean @ turn, scale, scalar_mean, scalar_std, gain, outside
     poses = pose_mean, pose_basis.reshape(-1, *shape[1:]), pose_scale
-    return Chart(*(jnp.asarray(array, jnp.float32) for array in (*arrays, *poses)))
+    return TangentPCA(*(jnp.asarray(array, jnp.float32) for array in (*arrays, *poses)))
 
 
 @jax.jit
-def coordinates(chart: Chart, tangent: jax.Array, log_length: jax.Array, log_seconds: jax.Array, start, end):
+def encode(chart: TangentPCA, tangent: jax.Array, log_length: jax.Array, log_seconds: jax.Array, start, end):
     """Coordinates (2 + R,) of a tangent at p (T-1, L, 3), less what the basis lacks, and two scalars ()."""
     scalars = (jnp.stack([log_length, log_seconds]) - chart.scalar_mean[start, end]) / chart.scalar_std
     return jnp.concatenate([scalars, jnp.tensordot(chart.basis, tangent, 3)])
 
 
 @jax.jit
-def motion(chart: Chart, values: jax.Array, start, end) -> tuple[jax.Array, jax.Array, jax.Array]:
+def decode(chart: TangentPCA, values: jax.Array, start, end) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Coordinates (2 + R,) -> the tangent vector at p (T-1, L, 3), exactly tangent, log-length and log-seconds ()."""
     tangent = sphere.project(chart.p, jnp.tensordot(values[SCALARS:], chart.basis, 1))
     log_length, log_seconds = chart.scalar_mean[start, end] + chart.scalar_std * values[:SCALARS]
@@ -117,27 +117,27 @@ def motion(chart: Chart, values: jax.Array, start, end) -> tuple[jax.Array, jax.
 
 
 @jax.jit
-def pose(chart: Chart, here: jax.Array, start) -> jax.Array:
+def encode_pose(chart: TangentPCA, here: jax.Array, start) -> jax.Array:
     """The pose (D,) of a displacement from neutral (L, 3) at which a motion of the label `start` starts."""
     inside = jnp.tensordot(chart.pose_basis, here - chart.pose_mean[start], 2) / chart.pose_scale
     return jnp.where(jnp.asarray(start) == 0, 0.0, inside)
 
 
 @jax.jit
-def unpose(chart: Chart, pose: jax.Array, start) -> jax.Array:
+def decode_pose(chart: TangentPCA, pose: jax.Array, start) -> jax.Array:
     """The displacement (L, 3) of a pose (D,)."""
     return chart.pose_mean[start] + jnp.tensordot(pose * chart.pose_scale, chart.pose_basis, 1)
 
 
 @jax.jit
-def expected(chart: Chart, start, end, pose: jax.Array) -> jax.Array:
+def conditional_mean(chart: TangentPCA, start, end, pose: jax.Array) -> jax.Array:
     """The mean coordinates (2 + R,) of a pair's motions from a pose (D,), by linear regression."""
     return jnp.append(jnp.zeros(SCALARS), chart.mean[start, end]) + pose @ chart.gain[start]
 
 
 @jax.jit
-def unit(chart: Chart, start, end) -> jax.Array:
-    """The deviation (2 + R,) of the coordinates of a pair about `expected`."""
+def conditional_std(chart: TangentPCA, start, end) -> jax.Array:
+    """The deviation (2 + R,) of the coordinates of a pair about `conditional_mean`."""
     return jnp.append(jnp.ones(SCALARS), chart.scale[start, end])
 
 

@@ -26,11 +26,11 @@ class Plans(NamedTuple):
     """How the two networks are trained."""
 
     motion: fit_motion.FlowPlan = fit_motion.FlowPlan()
-    residual: fit_residual.Plan = fit_residual.Plan()
+    residual: fit_residual.ResidualPlan = fit_residual.ResidualPlan()
 
 
 def fit(
-    data: dataset.Store, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
+    data: dataset.Dataset, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
 ) -> bundle.Models:
     """Train on the training subjects of a store; `mesh` as in `training.run`.
 
@@ -40,10 +40,10 @@ def fit(
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = mesh_hierarchy.build(mean, faces)
-    known = motions.join(*transitions.everything(data, "train", names=data.labels, per_pair=transitions.CHARTED))
-    chart = transitions.chart_of(known, labels=len(data.labels), rank=transitions.rank_of(known))
-    examples = transitions.examples_of(
-        chart, transitions.everything(data, "train", names=data.labels, per_pair=transitions.SPREAD)
+    known = motions.join(*transitions.all_pairs(data, "train", names=data.labels, per_pair=transitions.CHARTED))
+    chart = transitions.fit_chart(known, labels=len(data.labels), rank=transitions.default_rank(known))
+    examples = transitions.encode_examples(
+        chart, transitions.all_pairs(data, "train", names=data.labels, per_pair=transitions.SPREAD)
     )
     generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed, mesh=mesh)
     beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
@@ -55,7 +55,7 @@ def fit(
     )
     return bundle.Models(
         labels=data.labels,
-        face=bundle.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.region(mean, faces, at)),
+        face=bundle.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.face_region(mean, faces, at)),
         motion=generator,
         starts=beginnings,
         hierarchy=hierarchy,
@@ -65,7 +65,7 @@ def fit(
     )
 
 
-def check(data: dataset.Store) -> None:
+def check(data: dataset.Dataset) -> None:
     """Raise `ValueError` for a dataset that nothing can be learnt from, with what it lacks."""
     people = data.subjects("train")
     if len(data.vertices) == 0:

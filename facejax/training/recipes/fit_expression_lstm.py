@@ -59,7 +59,7 @@ def fit(
     frames: int | None = None,
     masked: bool = True,
     seed: int = 0,
-) -> expression_lstm.Params:
+) -> expression_lstm.ExpressionLSTM:
     """Train one network for each of `labels` (name -> its number in `data.label`); parameters stacked, (E, ...).
 
     `frames` and `masked` as of `sequences.block`; a network gives the same numbers alone as in company as long as
@@ -85,21 +85,21 @@ def fit(
     scale, weights = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts) for parts in (scales, weights))
     rate = optax.cosine_decay_schedule(plan.rate, plan.steps, alpha=plan.final_rate)
     optimiser = optax.adam(rate)
-    step = steps.side_by_side(
+    step = steps.vectorize_models(
         steps.supervised(_loss(plan, config), optimiser), tuple(labels), np.array(list(labels.values()), np.int32)
     )
     state = loop.run(
         step,
-        steps.start_side_by_side(weights, optimiser, jax.random.key(seed + 1)),
+        steps.init_vectorized_models(weights, optimiser, jax.random.key(seed + 1)),
         _batches(rows, labels, plan.batch, seed),
         folder,
         steps=plan.steps,
         constants=((scale, jnp.stack(strengths)), jax.device_put(block)),
     )
-    return expression_lstm.Params(scale, state.params)
+    return expression_lstm.ExpressionLSTM(scale, state.params)
 
 
-def network(params: expression_lstm.Params, number: int) -> expression_lstm.Params:
+def network(params: expression_lstm.ExpressionLSTM, number: int) -> expression_lstm.ExpressionLSTM:
     """One of the stacked networks."""
     return jax.tree.map(lambda leaf: leaf[number], params)
 
@@ -123,14 +123,14 @@ def _loss(plan: ExpressionPlan, config: expression_lstm.Config) -> Callable:
         noise_key, feed_key = jax.random.split(key)
         if plan.noise:
             inputs = inputs + plan.noise * scale.step * jax.random.normal(noise_key, inputs.shape)
-        params = expression_lstm.Params(scale, weights)
+        params = expression_lstm.ExpressionLSTM(scale, weights)
         first = neutral if config.start == "neutral" else None
         if plan.feed == "truth":
             given = jnp.ones(mask.shape, bool)
             made = expression_lstm.predict(params, inputs, first)
         else:
             given = _given(feed_key, mask.shape, jnp.clip(done / (plan.ramp * plan.steps), 0, 1), plan.feed)
-            made = expression_lstm.follow(params, inputs, given, first)
+            made = expression_lstm.predict_scheduled(params, inputs, given, first)
         made, target = made / scale.step, target / scale.step
         # Only what is made from the very start: with a beginning to go by, nothing is left to chance.
         alone = mask & ~jnp.any(given[:, 1:], axis=1, keepdims=True)
@@ -160,4 +160,4 @@ def _claim(folder, data, block, labels, plan, config, seed) -> None:
     arrays = (block.targets, block.mask, block.neutral, data.label)
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
     what = {"plan": plan._asdict(), "config": config._asdict(), "labels": labels, "seed": seed, "recordings": digest}
-    metric_logger.claim(folder, what)
+    metric_logger.claim_folder(folder, what)

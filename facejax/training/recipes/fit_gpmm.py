@@ -15,46 +15,50 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.models.decoders import gpmm, linear
 
-SMOOTH = (0.0, 0.003, 0.01, 0.03, 0.06, 0.12, 0.25)
-NOISE = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+SMOOTHNESS_GRID = (0.0, 0.003, 0.01, 0.03, 0.06, 0.12, 0.25)
+NOISE_GRID = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 FOLDS = 4
 JUDGED = 12  # held-out people per fold, as many of their frames, and a quarter of the vertices: enough to choose by
 FRAMES = 24
-WORTH = 0.99  # a prior that is not plain has to be better by a hundredth
+MIN_RELATIVE_GAIN = 0.99  # a prior that is not plain has to be better by a hundredth
 
 
-class Fitted(NamedTuple):
+class FittedGPMM(NamedTuple):
     """The model, how it was chosen, and what it answers out of sample."""
 
-    params: gpmm.Params
+    params: gpmm.GPMM
     errors_mm: dict[gpmm.Prior, float]  # held out, of every prior
-    folds: tuple[tuple[gpmm.Params, np.ndarray], ...]  # models of part of the data, and the meshes (n,) held out
+    folds: tuple[tuple[gpmm.GPMM, np.ndarray], ...]  # models of part of the data, and the meshes (n,) held out
 
-    def held_out(self, train: Meshes) -> np.ndarray:
+    def held_out(self, train: MeshSubset) -> np.ndarray:
         """Displacements (G, N, 3) float32 of all meshes of `train`, each by the model that did not see it."""
         found = np.empty((train.count, *self.params.face.shape), np.float32)
         for params, rows in self.folds:
             for subject in np.unique(train.owner[rows]):
                 mine = rows[train.owner[rows] == subject]
-                found[mine] = _answer(gpmm.on_face(params, train.data.neutral[subject]), train.read(mine)[0])
+                found[mine] = _answer(gpmm.linear_map(params, train.data.neutral[subject]), train.read(mine)[0])
         return found
 
 
 class _People(NamedTuple):
     """Meshes by person, again and again."""
 
-    meshes: Meshes
+    meshes: MeshSubset
 
     def __iter__(self) -> Iterator[gpmm.Person]:
         return (gpmm.Person(*self.meshes.person(subject)) for subject in self.meshes.subjects)
 
 
 def fit(
-    train: Meshes, *, by: str = "subjects", carried: Sequence[bool] = (False, True), components: int = gpmm.COMPONENTS
-) -> Fitted:
+    train: MeshSubset,
+    *,
+    by: str = "subjects",
+    carried: Sequence[bool] = (False, True),
+    components: int = gpmm.COMPONENTS,
+) -> FittedGPMM:
     """Choose and fit. `carried` narrows the choice: `(False,)` where faces are not to be compared.
 
     The folds are fitted to every second mesh, with fewer components: they decide, and serve the training of what comes
@@ -66,31 +70,31 @@ def fit(
         raise ValueError(f"expected meshes of two or more {by}, got {len(names)}")
     held = [np.flatnonzero(np.isin(of, part)) for part in np.array_split(names, min(FOLDS, len(names)))]
     faces, at = np.asarray(train.data.faces), np.asarray(train.data.landmark_index)
-    face, hold = gpmm.survey(_People(train))
+    face, hold = gpmm.mean_face_and_motion(_People(train))
     errors, models, learnt = {}, {}, {}
     for kind in carried:
         learnt[kind] = _Carried(train, _carried(train, faces, face, hold) if kind else None)
         total, models[kind] = 0.0, []
         for rows in held:
             fit_on = np.setdiff1d(np.arange(train.count), rows)[::2]
-            _, motion = gpmm.survey(_People(train.rows(fit_on)))
-            known = gpmm.learn(
+            _, motion = gpmm.mean_face_and_motion(_People(train.rows(fit_on)))
+            known = gpmm.fit_statistics(
                 learnt[kind].only(fit_on), carried=kind, components=max(1, 3 * components // 4), passes=2
             )
-            params = gpmm.Params(faces, at, face, motion, hold, known, gpmm.Prior(kind))
+            params = gpmm.GPMM(faces, at, face, motion, hold, known, gpmm.Prior(kind))
             models[kind].append((params, rows))
             total = total + _errors(params, train, rows)
         errors |= dict(zip(_priors(kind), (total / len(held)).tolist(), strict=True))
     prior = _best(errors)
     folded = tuple((params._replace(prior=prior), rows) for params, rows in models[prior.carried])
-    known = gpmm.learn(learnt[prior.carried], carried=prior.carried, components=components)
-    return Fitted(gpmm.Params(faces, at, face, hold, hold, known, prior), errors, folded)
+    known = gpmm.fit_statistics(learnt[prior.carried], carried=prior.carried, components=components)
+    return FittedGPMM(gpmm.GPMM(faces, at, face, hold, hold, known, prior), errors, folded)
 
 
 class _Carried(NamedTuple):
     """Meshes with other displacements in their place: iterated again and again."""
 
-    meshes: Meshes
+    meshes: MeshSubset
     moved: np.ndarray | None  # (G, N, 3); None: their own
 
     def __iter__(self):
@@ -103,19 +107,19 @@ class _Carried(NamedTuple):
         return _Carried(self.meshes.rows(rows), None if self.moved is None else self.moved[rows])
 
 
-def _carried(train: Meshes, faces: np.ndarray, face: np.ndarray, hold: np.ndarray) -> np.ndarray:
+def _carried(train: MeshSubset, faces: np.ndarray, face: np.ndarray, hold: np.ndarray) -> np.ndarray:
     """All displacements (G, N, 3) on the mean face, in float32: 40 KB a mesh of 3,260 vertices."""
     found = np.empty((train.count, *face.shape), np.float32)
     for subject, person in zip(train.subjects, _People(train), strict=True):
-        found[train.owner == subject] = gpmm.carry_to(person, faces, face, hold)
+        found[train.owner == subject] = gpmm.transfer_to(person, faces, face, hold)
     return found
 
 
 def _priors(carried: bool) -> list[gpmm.Prior]:
-    return [gpmm.Prior(carried, smooth, noise) for smooth in SMOOTH for noise in NOISE]
+    return [gpmm.Prior(carried, smooth, noise) for smooth in SMOOTHNESS_GRID for noise in NOISE_GRID]
 
 
-def _errors(params: gpmm.Params, train: Meshes, rows: np.ndarray) -> np.ndarray:
+def _errors(params: gpmm.GPMM, train: MeshSubset, rows: np.ndarray) -> np.ndarray:
     """Mean vertex distance in mm of some held-out people's frames, under each prior."""
     rng = np.random.default_rng(0)
     everybody = np.unique(train.owner[rows])
@@ -126,13 +130,13 @@ def _errors(params: gpmm.Params, train: Meshes, rows: np.ndarray) -> np.ndarray:
         mine = rows[train.owner[rows] == subject]
         landmarks, vertices = train.read(np.sort(rng.permutation(mine)[:FRAMES]))
         known = gpmm.covariances(params, train.data.neutral[subject], only=only)
-        off = [gpmm.answer(known, prior, landmarks) - vertices[:, only] for prior in _priors(params.prior.carried)]
+        off = [gpmm.predict(known, prior, landmarks) - vertices[:, only] for prior in _priors(params.prior.carried)]
         total = total + np.array([np.linalg.norm(one, axis=-1).mean(axis=-1).sum() for one in off])
         count += len(vertices)
     return total / count
 
 
-def _answer(map_: linear.Params, landmarks: np.ndarray) -> np.ndarray:
+def _answer(map_: linear.LinearMap, landmarks: np.ndarray) -> np.ndarray:
     return np.asarray(linear.apply(map_, landmarks))
 
 
@@ -143,6 +147,6 @@ def _best(errors: dict[gpmm.Prior, float]) -> gpmm.Prior:
         some = {prior: error for prior, error in errors.items() if simpler(prior)}
         if some:
             least = min(some, key=some.get)
-            if some[least] * WORTH <= errors[best]:
+            if some[least] * MIN_RELATIVE_GAIN <= errors[best]:
                 return least
     return best

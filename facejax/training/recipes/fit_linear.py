@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.models.decoders import linear
 
 ALPHAS = tuple(10.0**e for e in range(-8, 3))
 FOLDS = 4
 
 
-def fit_linear(model: linear.Model, train: Meshes, *, by: str = "subjects", **options) -> tuple[linear.Params, float]:
+def fit_linear(
+    model: linear.Model, train: MeshSubset, *, by: str = "subjects", **options
+) -> tuple[linear.LinearMap, float]:
     """Fit ridge, PCA or a dictionary, the prior's weight chosen by cross-validation; and that weight.
 
     Held out in turn are quarters of the training subjects, or `by="labels"` of the expressions.

@@ -54,7 +54,7 @@ class FlowPlan(NamedTuple):
 
 def fit_gan(
     examples: transitions.Examples,
-    chart: tangent_pca.Chart,
+    chart: tangent_pca.TangentPCA,
     folder: str | os.PathLike,
     *,
     plan: GanPlan = GanPlan(),
@@ -62,7 +62,7 @@ def fit_gan(
     seed: int = 0,
     average: bool = True,
     mesh: Mesh | None = None,
-) -> motion3dgan.Params:
+) -> motion3dgan.Motion3DGAN:
     """Train the generator against its critic; returns its moving average, or with `average` off its last state.
 
     Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
@@ -83,10 +83,10 @@ def fit_gan(
     )
     step = steps.adversarial(
         lambda weights, chart, key, condition: motion3dgan.generator.inner(
-            motion3dgan.Params(chart, weights), jax.random.normal(key, (config.noise,)), *condition
+            motion3dgan.Motion3DGAN(chart, weights), jax.random.normal(key, (config.noise,)), *condition
         ),
         lambda weights, chart, values, condition: motion3dgan.critic.inner(
-            motion3dgan.Params(chart, weights), values, *condition
+            motion3dgan.Motion3DGAN(chart, weights), values, *condition
         ),
         optimisers,
         critic_steps=plan.critic_steps,
@@ -94,21 +94,21 @@ def fit_gan(
         terms=_terms(plan) if plan.reconstruction or plan.length or plan.geodesic else None,
         decay=plan.decay,
     )
-    state = steps.start_adversarial(players, optimisers, play_key)
+    state = steps.init_adversarial(players, optimisers, play_key)
     state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed, mesh)
-    return motion3dgan.Params(chart, state.extra if average else state.params.generator)
+    return motion3dgan.Motion3DGAN(chart, state.extra if average else state.params.generator)
 
 
 def fit_flow(
     examples: transitions.Examples,
-    chart: tangent_pca.Chart,
+    chart: tangent_pca.TangentPCA,
     folder: str | os.PathLike,
     *,
     plan: FlowPlan = FlowPlan(),
     config: flow_matching.Config = flow_matching.Config(),
     seed: int = 0,
     mesh: Mesh | None = None,
-) -> flow_matching.Params:
+) -> flow_matching.FlowMatching:
     """Train a velocity field; returns its moving average. Chart, config, folder and mesh as in `fit_gan`.
 
     Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
@@ -123,13 +123,13 @@ def fit_flow(
         values, condition = batch
         source_key, time_key = jax.random.split(key)
         keys = jax.random.split(source_key, len(values))
-        source = jax.vmap(flow_matching.source, (None, 0, 0, 0, 0))(chart, keys, *condition)
-        target = jax.vmap(flow_matching.wrap, (None, 0))(chart, values)
+        source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
+        target = jax.vmap(flow_matching.to_state, (None, 0))(chart, values)
         unit = jax.vmap(flow_matching.unit, (None, 0, 0))(chart, *condition[:2])
         # Of one size in the mean, whatever the power: the two scalars keep their weight.
         size = jnp.sqrt(jnp.mean(unit ** (2 - 2 * plan.whitening), axis=1, keepdims=True))
         unit = size * unit**plan.whitening
-        params = flow_matching.Params(chart, weights)
+        params = flow_matching.FlowMatching(chart, weights)
 
         def field(state, time, condition):
             return flow_matching.velocity(params, state, time, *condition)
@@ -137,22 +137,22 @@ def fit_flow(
         return losses.flow_matching(field, time_key, source, target, condition, unit), {}
 
     optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
-    step = steps.averaged(steps.supervised(loss, optimiser), plan.decay)
-    state = steps.start_supervised(weights, optimiser, run_key)._replace(extra=weights)
+    step = steps.with_moving_average(steps.supervised(loss, optimiser), plan.decay)
+    state = steps.init_supervised(weights, optimiser, run_key)._replace(extra=weights)
     state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed, mesh)
-    return flow_matching.Params(chart, state.extra)
+    return flow_matching.FlowMatching(chart, state.extra)
 
 
 def fit_reference(
     known: motions.Motions,
-    chart: tangent_pca.Chart,
+    chart: tangent_pca.TangentPCA,
     folder: str | os.PathLike,
     *,
     plan: GanPlan = REFERENCE,
     config: motion3dgan_reference.Config = motion3dgan_reference.Config(),
     seed: int = 0,
     mesh: Mesh | None = None,
-) -> motion3dgan_reference.Params:
+) -> motion3dgan_reference.Motion3DGANReference:
     """Train the GAN as its authors built it, on whole tangent vectors; returns the generator's moving average."""
     _, steps_, landmarks, _ = chart.basis.shape
     config = config._replace(steps=steps_, landmarks=landmarks, labels=len(chart.mean))
@@ -172,7 +172,7 @@ def fit_reference(
         return chart.scalar_mean[*pair, 0], chart.scalar_std[0]
 
     def generate(weights, chart, key, pair):
-        params = motion3dgan_reference.Params(chart, weights)
+        params = motion3dgan_reference.Motion3DGANReference(chart, weights)
         tangent, log_length = motion3dgan_reference.generator.apply(
             params, jax.random.normal(key, (config.noise,)), *pair
         )
@@ -183,7 +183,7 @@ def fit_reference(
 
     def score(weights, chart, sample, pair):
         mean, deviation = scalars(chart, pair)
-        params = motion3dgan_reference.Params(chart, weights)
+        params = motion3dgan_reference.Motion3DGANReference(chart, weights)
         return motion3dgan_reference.critic.apply(params, sample["tangent"], mean + deviation * sample["length"], *pair)
 
     def terms(chart, fake, real, pair):
@@ -197,8 +197,8 @@ def fit_reference(
         generate, score, optimisers, critic_steps=plan.critic_steps, penalty=plan.penalty, terms=terms, decay=plan.decay
     )
     state = loop.run(
-        loop.gathered(step),
-        steps.start_adversarial(players, optimisers, play_key),
+        loop.gather_batches(step),
+        steps.init_adversarial(players, optimisers, play_key),
         loop.epoch_indices(seed, len(known.curves), plan.batch * plan.critic_steps),
         folder,
         steps=plan.steps,
@@ -207,7 +207,7 @@ def fit_reference(
         save_seconds=120.0,
         mesh=mesh,
     )
-    return motion3dgan_reference.Params(chart, state.extra)
+    return motion3dgan_reference.Motion3DGANReference(chart, state.extra)
 
 
 def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, mesh):
@@ -216,7 +216,7 @@ def _run(step, state, examples: transitions.Examples, chart, folder, count: int,
     conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
     held = (jnp.asarray(examples.values), conditions), chart
     return loop.run(
-        loop.gathered(step),
+        loop.gather_batches(step),
         state,
         lambda first, count: rows[order(first, count)],
         folder,
@@ -226,7 +226,7 @@ def _run(step, state, examples: transitions.Examples, chart, folder, count: int,
     )
 
 
-def sized(config, chart: tangent_pca.Chart):
+def sized(config, chart: tangent_pca.TangentPCA):
     """A network's config with the sizes that the chart knows."""
     (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
     return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
@@ -237,7 +237,7 @@ def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> Non
         raise ValueError(f"plan: expected 1 step or more, got {plan.steps}")
     digest = hashlib.sha256(np.ascontiguousarray(known)).hexdigest()
     record = {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest, "kind": kind}
-    metric_logger.claim(folder, record)
+    metric_logger.claim_folder(folder, record)
 
 
 def _terms(plan: GanPlan):
@@ -254,6 +254,6 @@ def _terms(plan: GanPlan):
     return terms
 
 
-def _distances(chart: tangent_pca.Chart, fake: jax.Array, real: jax.Array) -> jax.Array:
-    fake, real = (jax.vmap(flow_matching.wrap, (None, 0))(chart, values)[0] for values in (fake, real))
+def _distances(chart: tangent_pca.TangentPCA, fake: jax.Array, real: jax.Array) -> jax.Array:
+    fake, real = (jax.vmap(flow_matching.to_state, (None, 0))(chart, values)[0] for values in (fake, real))
     return sphere.distance(fake, real)

@@ -13,7 +13,7 @@ import optax
 from jax.sharding import Mesh
 
 from facejax import losses
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.mesh.hierarchy import Hierarchy
 from facejax.mesh.stencils import Stencil
 from facejax.models.decoders import neural3dmm, s2d_dec
@@ -23,7 +23,7 @@ from facejax.training.recipes import fit_s2d_dec
 BATCH = 16
 
 
-class Plan(NamedTuple):
+class Neural3DMMPlan(NamedTuple):
     """How it is trained: L_pr alone (Otberdout et al. 2023, 4.2), otherwise as S2D-Dec."""
 
     steps: int = 3_000
@@ -33,27 +33,29 @@ class Plan(NamedTuple):
     weighting: str = "linear"
 
 
-class Fitted(NamedTuple):
+class FittedNeural3DMM(NamedTuple):
     """Everything that `apply` needs."""
 
-    params: neural3dmm.Params
+    params: neural3dmm.Neural3DMM
     hierarchy: Hierarchy
     down: tuple[Stencil, ...]
 
 
 def fit(
-    train: Meshes,
+    train: MeshSubset,
     hierarchy: Hierarchy,
     folder: str | os.PathLike,
     *,
-    plan: Plan = Plan(),
+    plan: Neural3DMMPlan = Neural3DMMPlan(),
     seed: int = 0,
     mesh: Mesh | None = None,
-) -> Fitted:
+) -> FittedNeural3DMM:
     """Train on meshes; `mesh` as in `training.run`."""
     data = train.data
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
-    metric_logger.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
+    metric_logger.claim_folder(
+        folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
+    )
     faces = np.asarray(data.neutral[train.subjects], np.float64)
     marks = s2d_dec.measure(train)
     scale = neural3dmm.Scale(
@@ -65,14 +67,14 @@ def fit(
     weights = fit_s2d_dec.vertex_weights(train, plan.weighting)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     params = neural3dmm.init(init_key, hierarchy, scale)
-    down = jax.device_put(neural3dmm.descents(hierarchy))
+    down = jax.device_put(neural3dmm.downsampling_spirals(hierarchy))
     hierarchy = jax.device_put(hierarchy)
 
     def loss(trained, key, batch, constants):
         scale, hierarchy, down, weights, neutrals = constants
         marks, target, owner = batch
         rest = neutrals[owner]
-        found = neural3dmm.apply(neural3dmm.Params(scale, trained), hierarchy, down, marks, rest) - rest
+        found = neural3dmm.apply(neural3dmm.Neural3DMM(scale, trained), hierarchy, down, marks, rest) - rest
         distance = jnp.linalg.norm(jax.lax.stop_gradient(found - target), axis=-1)
         return losses.weighted_l1(found, target, weights), {"error_mm": jnp.mean(distance)}
 
@@ -86,7 +88,7 @@ def fit(
 
     state = loop.run(
         steps.supervised(loss, optimiser),
-        steps.start_supervised(params.weights, optimiser, run_key),
+        steps.init_supervised(params.weights, optimiser, run_key),
         batches,
         folder,
         steps=plan.steps,
@@ -94,10 +96,10 @@ def fit(
         chunk=50,
         mesh=mesh,
     )
-    return Fitted(neural3dmm.Params(scale, state.params), hierarchy, down)
+    return FittedNeural3DMM(neural3dmm.Neural3DMM(scale, state.params), hierarchy, down)
 
 
-def apply(fitted: Fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def apply(fitted: FittedNeural3DMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     """Vertex displacements (T, N, 3) of one face (N, 3) from its landmarks' (T, L, 3)."""
     found = [np.empty((0, *np.shape(neutral)), np.float32)]
     for low in range(0, len(displacements), BATCH):

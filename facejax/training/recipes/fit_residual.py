@@ -18,7 +18,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.io import weights
 from facejax.mesh import strain
 from facejax.mesh.hierarchy import Hierarchy
@@ -27,10 +27,10 @@ from facejax.training import loop, metric_logger, sharding, steps
 from facejax.training.recipes import fit_gpmm
 
 GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
-WORTH = 0.995  # a gate that is not 0 has to be better by half a hundredth
+MIN_RELATIVE_GAIN = 0.995  # a gate that is not 0 has to be better by half a hundredth
 
 
-class Plan(NamedTuple):
+class ResidualPlan(NamedTuple):
     """How the network is trained."""
 
     steps: int = 2_500
@@ -42,16 +42,16 @@ class Plan(NamedTuple):
 
 
 def fit(
-    train: Meshes,
+    train: MeshSubset,
     hierarchy: Hierarchy,
     folder: str | os.PathLike,
     *,
-    plan: Plan = Plan(),
+    plan: ResidualPlan = ResidualPlan(),
     by: str = "subjects",
     seed: int = 0,
-    base: fit_gpmm.Fitted | None = None,
+    base: fit_gpmm.FittedGPMM | None = None,
     mesh: Mesh | None = None,
-) -> gpmm_residual.Params:
+) -> gpmm_residual.GPMMResidual:
     """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit.
 
     `mesh` as in `training.run`.
@@ -60,12 +60,12 @@ def fit(
     chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
     base = base or fit_gpmm.fit(train, by=by)
     claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
-    metric_logger.claim(folder, claim | {"base": base.params.prior._asdict()})
-    tables = jax.device_put(strain.around(np.asarray(data.faces), len(base.params.face)))
+    metric_logger.claim_folder(folder, claim | {"base": base.params.prior._asdict()})
+    tables = jax.device_put(strain.vertex_triangles(np.asarray(data.faces), len(base.params.face)))
     hierarchy = jax.device_put(hierarchy)
     done = folder / "network.safetensors"
     if done.exists():
-        return gpmm_residual.Params(
+        return gpmm_residual.GPMMResidual(
             base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables
         )
     answers = base.held_out(train)
@@ -79,7 +79,7 @@ def fit(
         scale, hierarchy, tables, neutrals = constants
         marks, start, target, owner = batch
         found = residual.apply(
-            residual.Params(scale, trained, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
+            residual.ResidualDecoder(scale, trained, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
         )
         squared = jnp.sum(jnp.square((found - target) / scale.unit), axis=-1)
         # Charbonnier: a distance, squared near zero.
@@ -97,7 +97,7 @@ def fit(
 
     state = loop.run(
         steps.supervised(loss, optimiser),
-        steps.start_supervised(params.weights, optimiser, run_key),
+        steps.init_supervised(params.weights, optimiser, run_key),
         batches,
         folder,
         steps=plan.steps,
@@ -105,23 +105,23 @@ def fit(
         chunk=25,
         mesh=mesh,
     )
-    network = residual.Params(scale, state.params, jnp.ones(()))
-    fitted = gpmm_residual.Params(base.params, network, hierarchy, tables)
+    network = residual.ResidualDecoder(scale, state.params, jnp.ones(()))
+    fitted = gpmm_residual.GPMMResidual(base.params, network, hierarchy, tables)
     network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
     # What was judged is kept: the answers that it was judged by take a minute to come by.
-    if sharding.is_first():
+    if sharding.is_primary():
         weights.save(done, network._asdict())
-    sharding.meet("the network is written")
+    sharding.barrier("the network is written")
     return fitted._replace(network=network)
 
 
-def _load(path: Path, hierarchy: Hierarchy, base: gpmm.Params, landmarks: int) -> residual.Params:
+def _load(path: Path, hierarchy: Hierarchy, base: gpmm.GPMM, landmarks: int) -> residual.ResidualDecoder:
     blank = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((landmarks, 3)), jnp.ones(()), jnp.ones(()))
     like = jax.eval_shape(lambda key: residual.init(key, hierarchy, blank), jax.random.key(0))
-    return residual.Params(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
+    return residual.ResidualDecoder(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
 
 
-def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
+def _measure(train: MeshSubset, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
     sums, squares, left, count = 0.0, 0.0, 0.0, 0
     for marks, vertices in train:
         left += np.sum(np.square(vertices - answers[count : count + len(vertices)], dtype=np.float64))
@@ -133,7 +133,7 @@ def _measure(train: Meshes, answers: np.ndarray, face: np.ndarray) -> residual.S
     return residual.Scale(*(jnp.asarray(x, jnp.float32) for x in (face, mean, deviation, unit)))
 
 
-def _gate(fitted: gpmm_residual.Params, train: Meshes, answers: np.ndarray, kept: np.ndarray) -> float:
+def _gate(fitted: gpmm_residual.GPMMResidual, train: MeshSubset, answers: np.ndarray, kept: np.ndarray) -> float:
     """The share of the network's answer with the least error on meshes that it was not trained on."""
     errors, count = np.zeros(len(GATES)), 0
     for low in range(0, len(kept), 256):
@@ -146,4 +146,4 @@ def _gate(fitted: gpmm_residual.Params, train: Meshes, answers: np.ndarray, kept
         errors += [np.linalg.norm(left - gate * whole, axis=-1).mean(axis=-1).sum() for gate in GATES]
         count += len(rows)
     best = int(np.argmin(errors))
-    return GATES[best] if errors[best] < WORTH * errors[0] else 0.0
+    return GATES[best] if errors[best] < MIN_RELATIVE_GAIN * errors[0] else 0.0

@@ -18,13 +18,13 @@ import optax
 from jax.sharding import Mesh
 
 from facejax import losses
-from facejax.data.mesh_subset import Meshes
+from facejax.data.mesh_subset import MeshSubset
 from facejax.mesh.hierarchy import Hierarchy
 from facejax.models.decoders import s2d_dec
 from facejax.training import loop, metric_logger, steps
 
 
-class Plan(NamedTuple):
+class S2DDecPlan(NamedTuple):
     """How S2D-Dec is trained."""
 
     steps: int = 12_000
@@ -38,21 +38,23 @@ class Plan(NamedTuple):
 
 
 def fit(
-    meshes: Meshes,
+    meshes: MeshSubset,
     hierarchy: Hierarchy,
     folder: str | os.PathLike,
     *,
-    plan: Plan = Plan(),
+    plan: S2DDecPlan = S2DDecPlan(),
     seed: int = 0,
     mesh: Mesh | None = None,
-) -> s2d_dec.Params:
+) -> s2d_dec.S2DDec:
     """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole.
 
     `mesh` as in `training.run`.
     """
     data = meshes.data
     chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
-    metric_logger.claim(folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen})
+    metric_logger.claim_folder(
+        folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
+    )
     weights = vertex_weights(meshes, plan.weighting)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     scale = s2d_dec.measure(meshes)
@@ -61,7 +63,7 @@ def fit(
     def loss(trained, key, batch, constants):
         scale, hierarchy, weights = constants
         marks, target = batch
-        predicted = s2d_dec.apply(s2d_dec.Params(scale, trained), hierarchy, marks)
+        predicted = s2d_dec.apply(s2d_dec.S2DDec(scale, trained), hierarchy, marks)
         value = losses.s2d(predicted, target, weights, beta1=plan.beta1, beta2=plan.beta2, reduction=plan.reduction)
         # The distance is for the journal alone: its gradient at a vertex that is met exactly would be NaN.
         distance = jnp.linalg.norm(jax.lax.stop_gradient(predicted - target), axis=-1)
@@ -70,7 +72,7 @@ def fit(
     optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
     state = loop.run(
         steps.supervised(loss, optimiser),
-        steps.start_supervised(params.weights, optimiser, run_key),
+        steps.init_supervised(params.weights, optimiser, run_key),
         mesh_batches(meshes, plan.batch, seed),
         folder,
         steps=plan.steps,
@@ -78,10 +80,10 @@ def fit(
         chunk=50,
         mesh=mesh,
     )
-    return s2d_dec.Params(scale, state.params)
+    return s2d_dec.S2DDec(scale, state.params)
 
 
-def vertex_weights(meshes: Meshes, weighting: str) -> jax.Array:
+def vertex_weights(meshes: MeshSubset, weighting: str) -> jax.Array:
     """`losses.landmark_weights` (N,) on the mean neutral face of the meshes' subjects."""
     template = np.asarray(meshes.data.neutral[meshes.subjects], np.float64).mean(axis=0)
     return losses.landmark_weights(
@@ -90,7 +92,7 @@ def vertex_weights(meshes: Meshes, weighting: str) -> jax.Array:
     )  # fmt: skip
 
 
-def mesh_batches(meshes: Meshes, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
+def mesh_batches(meshes: MeshSubset, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
     """`batches(first, count)`: landmarks (count, B, L, 3) and vertices (count, B, N, 3), read as they are needed."""
     indices = loop.epoch_indices(seed, meshes.count, batch)
 

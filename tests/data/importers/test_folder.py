@@ -152,7 +152,7 @@ def test_frames_and_subjects_are_in_natural_order(ball, tmp_path):
     np.testing.assert_array_equal(data.vertices, np.concatenate([moved, moved]))
     assert [s["name"] for s in data.index["subjects"]] == ["P9", "P10"]
     names = ["a", "a1", "a01", "a2b10", "a2b9", "a10", "B", "1"]
-    assert sorted(names, key=base.natural) == ["1", "a", "a01", "a1", "a2b9", "a2b10", "a10", "B"]
+    assert sorted(names, key=base.natural_sort_key) == ["1", "a", "a01", "a1", "a2b9", "a2b10", "a10", "B"]
 
 
 def test_a_missing_neutral_is_the_first_frame(capture, ball):
@@ -253,7 +253,7 @@ def test_what_lies_elsewhere_is_passed_over(capture, ball):
 )
 def test_events(curve, expected):
     rest, way = np.random.default_rng(0).normal(size=(2, 7, 3))
-    assert apex_detection.find(rest + np.array(curve)[:, None, None] * way, rest) == expected
+    assert apex_detection.detect(rest + np.array(curve)[:, None, None] * way, rest) == expected
 
 
 def test_events_by_a_loop():
@@ -267,7 +267,7 @@ def test_events_by_a_loop():
             onset = t if energy[t] < 0.05 * max(energy) else onset
         for t in range(11, apex[-1], -1):
             offset = t if energy[t] < 0.05 * max(energy) else offset
-        assert apex_detection.find(curve, rest) == (onset, apex[0], apex[-1], offset)
+        assert apex_detection.detect(curve, rest) == (onset, apex[0], apex[-1], offset)
 
 
 def test_a_recording_with_one_half_is_said_and_used(capture, ball):

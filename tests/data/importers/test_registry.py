@@ -117,7 +117,7 @@ def test_bu4dfe_has_landmarks_alone(tmp_path, tiny_store):
     assert data.index["rate"] == 25 and data.labels == ("neutral", "angry", "happy")
     halves = motions.halves(data, "train")
     assert halves.curves.shape == (8, 30, 83, 3)
-    with pytest.raises(dataset.StoreError, match="holds landmarks alone, expected meshes"):
+    with pytest.raises(dataset.DatasetError, match="holds landmarks alone, expected meshes"):
         dataset.open_meshes(data.path)
     with pytest.raises(ValueError, match="holds landmarks alone"):
         fit_bundle.check(data)
@@ -370,17 +370,17 @@ def test_ten_kills_at_random_moments(tmp_path, marks, tiny_store):
             process.send_signal(signal.SIGKILL)
             killed += process.wait() == -signal.SIGKILL
         if (tmp_path / "killed").exists():  # it was faster
-            assert _bytes(dataset.open_store(tmp_path / "killed")) == _bytes(whole)
+            assert _bytes(dataset.open_dataset(tmp_path / "killed")) == _bytes(whole)
             shutil.rmtree(tmp_path / "killed")
     assert killed >= 3
     if not (tmp_path / "killed").exists():
         prepared(root, marks, out="killed")
-    assert _bytes(dataset.open_store(tmp_path / "killed")) == _bytes(whole)
+    assert _bytes(dataset.open_dataset(tmp_path / "killed")) == _bytes(whole)
 
 
 def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_path, monkeypatch):
     root = capture("coma")
-    real, seen = worker.do, []
+    real, seen = worker.import_recording, []
 
     def stop(job, number):
         seen.append(number)
@@ -400,7 +400,7 @@ def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_p
 @pytest.mark.parametrize("trouble", [OSError("No space left on device"), RuntimeError("a process was lost")])
 def test_trouble_that_is_not_of_the_recordings_loses_nothing(capture, marks, tmp_path, monkeypatch, trouble):
     root = capture("coma")
-    whole, real, seen = prepared(root, marks, out="whole"), worker.do, []
+    whole, real, seen = prepared(root, marks, out="whole"), worker.import_recording, []
 
     def fail(job, number):
         if number == 2:
@@ -415,7 +415,7 @@ def test_trouble_that_is_not_of_the_recordings_loses_nothing(capture, marks, tmp
     assert _bytes(prepared(root, marks)) == _bytes(whole) and seen == [2, 3, 4, 5]
 
 
-def _bytes(data: dataset.Store) -> dict[str, bytes]:
+def _bytes(data: dataset.Dataset) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in data.path.iterdir()}
 
 

@@ -50,12 +50,12 @@ def test_table_5_has_39_transitions_of_13_starts():
 
 def test_head_motion_is_rigid_and_leans_back(template):
     angle = np.array([[0.0, 0, 0], [0.2, 0.1, -0.05]], np.float32)
-    moved = makehuman4d.turn(np.stack([template.vertices] * 2), angle)
+    moved = makehuman4d.rotate_head(np.stack([template.vertices] * 2), angle)
     np.testing.assert_allclose(moved[0], template.vertices, atol=1e-4)
     before = np.linalg.norm(template.vertices[:100] - template.vertices[100:200], axis=1)
     np.testing.assert_allclose(np.linalg.norm(moved[1, :100] - moved[1, 100:200], axis=1), before, atol=1e-3)
     tip = template.landmarks[30]
-    back = makehuman4d.turn(template.vertices[None], np.array([[0.2, 0, 0]]))[0]
+    back = makehuman4d.rotate_head(template.vertices[None], np.array([[0.2, 0, 0]]))[0]
     assert back[tip, 1] > template.vertices[tip, 1] and back[tip, 2] < template.vertices[tip, 2]
 
 
@@ -96,10 +96,10 @@ def test_damaged_store_is_named(tiny_spec, tmp_path, damage, message):
     spec = tiny_spec._replace(subjects=3, level=0)
     path = makehuman4d.prepare(spec, folder=tmp_path).path
     damage(path)
-    with pytest.raises(dataset.StoreError, match=message):
-        dataset.open_store(path)
+    with pytest.raises(dataset.DatasetError, match=message):
+        dataset.open_dataset(path)
 
 
 def test_unknown_split_lists_the_known(tiny_store):
-    with pytest.raises(dataset.StoreError, match="train, validation, test"):
+    with pytest.raises(dataset.DatasetError, match="train, validation, test"):
         tiny_store.subjects("dev")

@@ -99,7 +99,7 @@ def test_lips_do_not_cross(rigs):
 def test_lips_stay_in_front_of_the_teeth(rigs):
     posed = rigs[2]
     far_back = posed.neutral[None] - np.array([0, 0, 8], np.float32)
-    held = contact.keep_off_teeth(posed.contact, far_back)[0, posed.contact.teeth_index]
+    held = contact.clear_teeth(posed.contact, far_back)[0, posed.contact.teeth_index]
     x = held[:, 0]
     arch = posed.contact.teeth_arch
     assert np.all(held[:, 2] >= arch[0] + x * (arch[1] + x * arch[2]) + posed.contact.teeth_margin - 1e-4)
@@ -127,7 +127,7 @@ def test_deformation_transfer_follows_size():
 
 def test_gradient_of_a_linear_function_is_its_slope_in_the_plane(template):
     slope = np.array([0.3, -1.1, 0.7])
-    operator, areas = deformation_transfer.gradient(template.vertices.astype(np.float64), template.faces)
+    operator, areas = deformation_transfer.gradient_operator(template.vertices.astype(np.float64), template.faces)
     found = (operator @ (template.vertices @ slope)).reshape(-1, 3)
     a, b, c = (template.vertices[template.faces[:, i]].astype(np.float64) for i in range(3))
     normal = np.cross(b - a, c - a)

@@ -29,7 +29,7 @@ def learn(pair, **options):
 
 def codes(learned, vertices, l1=L1, l2=L2, steps=2000):
     x = (vertices - learned.vertex_mean).reshape(len(vertices), -1)
-    found = dictionary.code(
+    found = dictionary.sparse_code(
         jnp.asarray(learned.atoms, jnp.float32), jnp.asarray(x, jnp.float32), l1=l1, l2=l2, steps=steps
     )
     return x, np.asarray(found, np.float64)
@@ -40,7 +40,9 @@ def test_codes_meet_the_conditions_of_the_elastic_net(l1, l2):
     rng = np.random.default_rng(0)
     atoms, x = rng.normal(size=(ATOMS, 30)), 3 * rng.normal(size=(40, 30))
     atoms /= np.linalg.norm(atoms, axis=1, keepdims=True)
-    found = dictionary.code(jnp.asarray(atoms, jnp.float32), jnp.asarray(x, jnp.float32), l1=l1, l2=l2, steps=1000)
+    found = dictionary.sparse_code(
+        jnp.asarray(atoms, jnp.float32), jnp.asarray(x, jnp.float32), l1=l1, l2=l2, steps=1000
+    )
     a = np.asarray(found, np.float64)
     slope = (a @ atoms - x) @ atoms.T + l2 * a
     used = a != 0

@@ -22,7 +22,7 @@ def person(seed, *, frames=FRAMES, neutral=None, modes=MODES):
         neutral = MEAN @ (np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
     moved = np.einsum("fr,rnx->fnx", rng.normal(size=(frames, len(modes))), modes)
     if neutral is not MEAN:
-        moved = deformation_transfer.Carrier(MEAN, neutral, FACES, np.full(N, 2.0))(moved)
+        moved = deformation_transfer.DeformationTransfer(MEAN, neutral, FACES, np.full(N, 2.0))(moved)
     return gpmm.Person(neutral, moved[:, PICKED], moved)
 
 
@@ -36,13 +36,13 @@ def fit(people, *prior, **options):
 
 
 def error(params, someone):
-    found = linear.apply(gpmm.on_face(params, someone.neutral), someone.landmarks)
+    found = linear.apply(gpmm.linear_map(params, someone.neutral), someone.landmarks)
     return float(np.linalg.norm(found - someone.vertices, axis=-1).mean())
 
 
 def test_the_survey_is_the_plain_loop(people):
     some = [people[0], people[1]._replace(landmarks=people[1].landmarks[:7], vertices=people[1].vertices[:7])]
-    face, motion = gpmm.survey(some)
+    face, motion = gpmm.mean_face_and_motion(some)
     np.testing.assert_allclose(face, (some[0].neutral + some[1].neutral) / 2)
     frames = [np.sum(frame**2, axis=-1) for each in some for frame in each.vertices]
     np.testing.assert_allclose(motion, np.sqrt(np.mean(frames, axis=0)))
@@ -50,7 +50,7 @@ def test_the_survey_is_the_plain_loop(people):
 
 @pytest.mark.parametrize("noise", [1e-2, 1.0])
 def test_plain_and_without_the_smooth_prior_it_is_ridge_regression(people, noise):
-    found = gpmm.on_face(fit(people, False, 0.0, noise), people[2].neutral)
+    found = gpmm.linear_map(fit(people, False, 0.0, noise), people[2].neutral)
     expected = linear.ridge.fit([(p.landmarks, p.vertices) for p in people], alpha=noise)
     for a, b in zip((*found[:2], *found.factors), (*expected[:2], *expected.factors), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
@@ -58,7 +58,7 @@ def test_plain_and_without_the_smooth_prior_it_is_ridge_regression(people, noise
 
 def test_carried_to_the_one_face_that_there_is_it_is_pca():
     known = [person(seed, neutral=MEAN) for seed in range(3)]
-    found = gpmm.on_face(fit(known, True, 0.0, 0.3, components=3), MEAN)
+    found = gpmm.linear_map(fit(known, True, 0.0, 0.3, components=3), MEAN)
     expected = linear.pca.fit([(p.landmarks, p.vertices) for p in known], alpha=0.3, components=3)
     np.testing.assert_allclose(found.factors[0], expected.factors[0] @ expected.factors[1], atol=1e-5)
     np.testing.assert_allclose(found.vertex_mean, expected.vertex_mean, atol=1e-5)
@@ -71,7 +71,7 @@ def test_against_the_whole_gaussian(people, carried):
     params, new = fit(people, *prior, components=4), person(7)
     known = params.statistics
     if carried:
-        carrier = deformation_transfer.Carrier(params.face, new.neutral, FACES, params.motion)
+        carrier = deformation_transfer.DeformationTransfer(params.face, new.neutral, FACES, params.motion)
         mean = carrier(known.vertex_mean[None])[0].ravel()
         spread = sum(
             variance * np.outer(moved, moved)
@@ -91,7 +91,7 @@ def test_against_the_whole_gaussian(people, carried):
     at = (3 * PICKED[:, None] + np.arange(3)).ravel()
     gain = np.linalg.solve(spread[np.ix_(at, at)] + prior.noise * np.eye(len(at)), spread[at])
     expected = mean + (new.landmarks.reshape(FRAMES, -1) - mean[at]) @ gain
-    found = linear.apply(gpmm.on_face(params, new.neutral), new.landmarks)
+    found = linear.apply(gpmm.linear_map(params, new.neutral), new.landmarks)
     np.testing.assert_allclose(found, expected.reshape(FRAMES, N, 3), atol=2e-4)
 
 
@@ -99,17 +99,17 @@ def test_against_the_whole_gaussian(people, carried):
 @pytest.mark.parametrize("only", [None, np.array([3, 9, 5, 41])], ids=["all", "some"])
 def test_answers_of_a_few_frames_are_those_of_the_map(people, carried, only):
     params, new = fit(people, carried, 0.1, 1e-2, components=4), person(7)
-    whole = linear.apply(gpmm.on_face(params, new.neutral), new.landmarks)
+    whole = linear.apply(gpmm.linear_map(params, new.neutral), new.landmarks)
     known = gpmm.covariances(params, new.neutral, only=only)
-    found = gpmm.answer(known, params.prior, new.landmarks)
+    found = gpmm.predict(known, params.prior, new.landmarks)
     np.testing.assert_allclose(found, whole if only is None else whole[:, only], atol=1e-4)
 
 
 def test_another_prior_is_that_of_a_fit_with_it(people):
     params, new = fit(people, True, 0.1, 1e-2, components=4), person(7)
     other = gpmm.Prior(True, 0.3, 1.0)
-    found = gpmm.answer(gpmm.covariances(params, new.neutral), other, new.landmarks)
-    expected = linear.apply(gpmm.on_face(fit(people, *other, components=4), new.neutral), new.landmarks)
+    found = gpmm.predict(gpmm.covariances(params, new.neutral), other, new.landmarks)
+    expected = linear.apply(gpmm.linear_map(fit(people, *other, components=4), new.neutral), new.landmarks)
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
@@ -130,7 +130,7 @@ def test_the_smooth_prior_takes_up_what_nobody_showed():
 
     def followed(smooth):
         params = fit(known, False, smooth, 1e-6)
-        at_rest, pushed = np.asarray(linear.apply(gpmm.on_face(params, MEAN), marks))
+        at_rest, pushed = np.asarray(linear.apply(gpmm.linear_map(params, MEAN), marks))
         return (pushed - at_rest) @ across, params.motion
 
     assert np.abs(followed(0.0)[0]).max() < 0.05
@@ -146,14 +146,14 @@ def test_what_never_moves_stays():
     known = [person(seed, neutral=MEAN, modes=modes) for seed in range(2)]
     for carried in (True, False):
         params = fit(known, carried, 0.3, 1e-3, components=4)
-        found = linear.apply(gpmm.on_face(params, MEAN), person(7).landmarks)
+        found = linear.apply(gpmm.linear_map(params, MEAN), person(7).landmarks)
         assert np.abs(found[:, MEAN[:, 2] < -20]).max() < 1e-6 < np.abs(found).max()
 
 
 def test_wrong_input_is_named(people):
     params = fit(people, False, 0.0, 1e-2)
     with pytest.raises(ValueError, match=r"neutral: expected vertices \(42, 3\), got \(41, 3\)"):
-        gpmm.on_face(params, MEAN[1:])
+        gpmm.linear_map(params, MEAN[1:])
     with pytest.raises(ValueError, match="at least one person with a frame"):
         fit([], False, 0.0, 1e-2)
     with pytest.raises(ValueError, match="at least one person with a frame"):
@@ -172,6 +172,6 @@ def test_noise_of_landmarks_is_found(noise):
     prior = gpmm.Prior(carried=False, smooth=0.0, noise=1e-8)
     params = gpmm.fit([gpmm.Person(rest, moved[:100, at], moved[:100])], faces, at, prior=prior)
     marks = moved[100:, at] + noise * rng.standard_normal((100, 30, 3))
-    assert gpmm.noise_of(params, rest, marks) == pytest.approx(noise, rel=0.05, abs=0.01)
+    assert gpmm.estimate_landmark_noise(params, rest, marks) == pytest.approx(noise, rel=0.05, abs=0.01)
     # One frame tells as well, less surely.
-    assert gpmm.noise_of(params, rest, marks[:1]) == pytest.approx(noise, rel=0.4, abs=0.01)
+    assert gpmm.estimate_landmark_noise(params, rest, marks[:1]) == pytest.approx(noise, rel=0.4, abs=0.01)

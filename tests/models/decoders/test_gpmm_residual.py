@@ -22,8 +22,8 @@ def built(store, *, carried, gate):
     scale = residual.Scale(jnp.asarray(base.face, jnp.float32), jnp.zeros((5, 3)), ones, 0.2 * ones)
     network = residual.init(jax.random.key(0), hierarchy, scale)
     spoken = network.weights | {"shared": 0.1 * jax.random.normal(jax.random.key(1), network.weights["shared"].shape)}
-    tables = strain.around(store.faces, len(base.face))
-    return gpmm_residual.Params(base, network._replace(weights=spoken, gate=jnp.float32(gate)), hierarchy, tables)
+    tables = strain.vertex_triangles(store.faces, len(base.face))
+    return gpmm_residual.GPMMResidual(base, network._replace(weights=spoken, gate=jnp.float32(gate)), hierarchy, tables)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def person(ball_store):
 
 def test_it_is_the_linear_answer_and_the_networks_share(params, person):
     neutral, marks, _ = person
-    base = np.asarray(linear.apply(gpmm.on_face(params.base, neutral), marks))
+    base = np.asarray(linear.apply(gpmm.linear_map(params.base, neutral), marks))
     rest = np.broadcast_to(neutral, base.shape)
     whole = residual.apply(params.network, params.hierarchy, params.tables, marks, base, rest)
     found = np.asarray(gpmm_residual.apply(params, marks, neutral))
@@ -63,7 +63,7 @@ def test_leading_axes_are_free_and_pieces_do_not_show(params, person, lead):
 def test_a_face_is_worked_out_once_and_the_last_few_are_remembered(params, person, monkeypatch):
     neutral, marks, _ = person
     asked = []
-    true = gpmm.on_face
+    true = gpmm.linear_map
     monkeypatch.setattr(gpmm_residual, "FACES", 2)
     monkeypatch.setattr(gpmm, "on_face", lambda base, face: asked.append(1) or true(base, face))
     faces = [neutral + shift for shift in (1.0, 2.0, 3.0)]
@@ -106,7 +106,9 @@ def test_told_of_noise_it_trusts_landmarks_less(params, person):
         gpmm_residual.apply(params, marks[:0], neutral, noise=None)
     assert gpmm_residual.apply(params, marks[:0], neutral).shape == (0, *neutral.shape)
     with pytest.raises(ValueError, match="kept as one map"):
-        gpmm.told(params.base._replace(statistics=linear.Params(jnp.zeros((5, 3)), jnp.zeros((162, 3)), ())), 0.5)
+        gpmm.with_landmark_noise(
+            params.base._replace(statistics=linear.LinearMap(jnp.zeros((5, 3)), jnp.zeros((162, 3)), ())), 0.5
+        )
 
 
 def test_a_traced_face_is_refused(params, person):
@@ -144,7 +146,7 @@ def test_a_file_of_linear_data_is_as_good_as_the_model():
     network = residual.init(
         jax.random.key(0), hierarchy, residual.Scale(jnp.asarray(rest), jnp.zeros((5, 3)), one, one)
     )
-    params = gpmm_residual.Params(base, network, hierarchy, strain.around(faces, len(rest)))
+    params = gpmm_residual.GPMMResidual(base, network, hierarchy, strain.vertex_triangles(faces, len(rest)))
     again = gpmm_residual.unpack(jax.tree.map(np.asarray, gpmm_residual.pack(params)), hierarchy, faces)
     errors = [np.abs(np.asarray(gpmm_residual.apply(p, moved[:, marks], rest)) - moved).max() for p in (params, again)]
     assert errors[0] < 1e-3 and errors[1] < 1.5 * errors[0]

@@ -16,7 +16,7 @@ BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 VERTICES, FACES, N = np.asarray(BALL.vertices), np.asarray(BALL.faces), len(BALL.vertices)
 HIERARCHY = mesh_hierarchy.build(VERTICES, FACES, factors=(3, 3), lengths=(7, 6), reference=0)
 PADDED = mesh_hierarchy.build(VERTICES, FACES, factors=(3, 3), lengths=(170, 60), reference=0)
-DOWN = neural3dmm.descents(HIERARCHY)
+DOWN = neural3dmm.downsampling_spirals(HIERARCHY)
 L, ENCODER, CHANNELS = 5, (4, 6), (8, 6, 4)
 
 
@@ -36,7 +36,7 @@ def parameters():
 
     leaves, tree = jax.tree.flatten(jax.eval_shape(blank, jax.random.key(0)))
     leaves = [array(10 + i, *leaf.shape) / np.sqrt(np.prod(leaf.shape[:-1]) + 1) for i, leaf in enumerate(leaves)]
-    return neural3dmm.Params(scale(), jax.tree.unflatten(tree, leaves))
+    return neural3dmm.Neural3DMM(scale(), jax.tree.unflatten(tree, leaves))
 
 
 def samples(seed, batch):
@@ -58,7 +58,7 @@ def descended(x, kernel, hierarchy, level):
 @pytest.mark.parametrize("level", [0, 1])
 @pytest.mark.parametrize("hierarchy", [HIERARCHY, PADDED], ids=["full", "padded"])
 def test_descents_gather_whole_spirals_of_what_is_kept(hierarchy, level):
-    down = neural3dmm.descents(hierarchy)
+    down = neural3dmm.downsampling_spirals(hierarchy)
     assert len(down) == 2
     x = array(1, hierarchy.sizes[level], 2, 3)
     kernel = array(2, hierarchy.spirals[level].shape[1], 3, 4)
@@ -89,7 +89,7 @@ def test_positions_are_those_of_the_plain_form():
     np.testing.assert_allclose(codes, [plain_code(params, face) for face in neutral], rtol=1e-3, atol=1e-3)
     moved = (marks - params.scale.landmark_mean).reshape(2, -1) / params.scale.landmark_std
     told = jnp.concatenate([codes, moved], axis=1)
-    out = jax.jit(s2d_dec.expand)(params.weights["decoder"], HIERARCHY, told)
+    out = jax.jit(s2d_dec.decode)(params.weights["decoder"], HIERARCHY, told)
     expected = params.scale.face + params.scale.face_std * out.transpose(1, 0, 2)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 

@@ -14,7 +14,7 @@ from facejax.models.decoders import residual, s2d_dec
 BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 VERTICES, FACES, N = np.asarray(BALL.vertices), np.asarray(BALL.faces), len(BALL.vertices)
 HIERARCHY = hierarchy.build(VERTICES, FACES, factors=(3, 3), lengths=(7, 6), reference=0)
-TABLES = strain.around(FACES, N)
+TABLES = strain.vertex_triangles(FACES, N)
 L, CHANNELS, MIXED = 5, (8, 6, 4), 5
 
 
@@ -36,7 +36,7 @@ def parameters():
     """Random everywhere, so that no term of the network vanishes."""
     leaves, tree = jax.tree.flatten(jax.device_get(blank().weights))
     leaves = [leaf + 0.1 * np.asarray(array(10 + i, *leaf.shape)) for i, leaf in enumerate(leaves)]
-    return residual.Params(scale(), jax.tree.unflatten(tree, leaves), jnp.float32(0.7))
+    return residual.ResidualDecoder(scale(), jax.tree.unflatten(tree, leaves), jnp.float32(0.7))
 
 
 def samples(seed, batch):
@@ -45,7 +45,7 @@ def samples(seed, batch):
     return array(seed, batch, L, 3), 0.2 * array(seed + 30, batch, N, 3), neutral
 
 
-climb = jax.jit(s2d_dec.climb)
+climb = jax.jit(s2d_dec.decode_levels)
 
 
 def plain(params, displacements, base, neutral):
@@ -119,7 +119,7 @@ def test_relabelled_vertices_give_relabelled_output():
     found = residual.apply(params, HIERARCHY, TABLES, marks, base, neutral)
     weights = params.weights | {name: params.weights[name][order] for name in ("own", "readout")}
     moved = params._replace(scale=params.scale._replace(face=params.scale.face[order]), weights=weights)
-    tables = strain.around(rank[FACES], N)
+    tables = strain.vertex_triangles(rank[FACES], N)
     relabelled = residual.apply(moved, hierarchy.load(arrays), tables, marks, base[:, order], neutral[:, order])
     np.testing.assert_allclose(relabelled, found[:, order], atol=1e-4)
 

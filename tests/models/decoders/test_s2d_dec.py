@@ -147,10 +147,10 @@ def test_same_shapes_trace_once():
 def test_expanding_is_climbing_and_one_convolution_more():
     weights = s2d_dec.init_weights(jax.random.key(1), HIERARCHY, inputs=6, channels=CHANNELS, outputs=7)
     x = array(3, 2, 6)
-    climb = jax.jit(s2d_dec.climb)
+    climb = jax.jit(s2d_dec.decode_levels)
     climbed = climb(weights, HIERARCHY, x)
     assert climbed.shape == (len(VERTICES), 2, CHANNELS[-1])
-    found = jax.jit(s2d_dec.expand)(weights, HIERARCHY, x)
+    found = jax.jit(s2d_dec.decode)(weights, HIERARCHY, x)
     for i in range(2):
         expected = plain_conv(climbed[:, i], HIERARCHY.spirals[0], weights["convs"][-1])
         np.testing.assert_allclose(found[:, i], expected, rtol=1e-4, atol=1e-4)

@@ -47,19 +47,19 @@ def values(seed, count=()):
 def test_states_are_motions_of_the_large_sphere(chart):
     """exp_p in R + 1 numbers is exp_p in all: same point, same distances; log-length and log-seconds pass."""
     a, b = values(0), values(1)
-    tangents = [tangent_pca.motion(chart, x, 1, 2) for x in (a, b)]
+    tangents = [tangent_pca.decode(chart, x, 1, 2) for x in (a, b)]
     points = [sphere.exp(chart.p, tangent) for tangent, *_ in tangents]
-    motions = [flow_matching.unwrap(chart, flow_matching.wrap(chart, x), 1, 2) for x in (a, b)]
+    motions = [flow_matching.from_state(chart, flow_matching.to_state(chart, x), 1, 2) for x in (a, b)]
     for (_, *scalars), point, made in zip(tangents, points, motions, strict=True):
         np.testing.assert_allclose(made.q, point, atol=2e-6)
         np.testing.assert_allclose(made[1:], scalars, rtol=1e-6)
         assert abs(float(sphere.norm(made.q)) - 1) < 1e-6
-    small = sphere.distance(flow_matching.wrap(chart, a)[0], flow_matching.wrap(chart, b)[0])
+    small = sphere.distance(flow_matching.to_state(chart, a)[0], flow_matching.to_state(chart, b)[0])
     assert float(small) == pytest.approx(float(sphere.distance(*points)), rel=1e-5)
 
 
 def test_velocity_is_tangent_and_told_of_everything(params):
-    state = flow_matching.wrap(params.chart, values(2))
+    state = flow_matching.to_state(params.chart, values(2))
     told = [
         (0.3, 1, 2, 0 * POSE),
         (0.6, 1, 2, 0 * POSE),
@@ -77,15 +77,15 @@ def test_a_field_of_zero_gives_the_source_and_the_source_is_the_gaussian(chart, 
     @jax.jit
     @jax.vmap
     def draw(key):
-        source = flow_matching.unwrap(chart, flow_matching.source(chart, key, 2, 1, POSE), 2, 1)
+        source = flow_matching.from_state(chart, flow_matching.sample_source(chart, key, 2, 1, POSE), 2, 1)
         drawn = flow_matching.sample(still, key, 2, 1, POSE, steps=2)
-        return source, drawn, tangent_pca.coordinates(chart, sphere.log(chart.p, drawn.q), *drawn[1:], 2, 1)
+        return source, drawn, tangent_pca.encode(chart, sphere.log(chart.p, drawn.q), *drawn[1:], 2, 1)
 
     source, drawn, got = draw(jax.random.split(jax.random.key(1), 3000))
     for a, b in zip(source, drawn, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     np.testing.assert_allclose(sphere.norm(drawn.q), 1, atol=1e-5)
-    expected, unit = tangent_pca.expected(chart, 2, 1, POSE), tangent_pca.unit(chart, 2, 1)
+    expected, unit = tangent_pca.conditional_mean(chart, 2, 1, POSE), tangent_pca.conditional_std(chart, 2, 1)
     assert np.all(np.abs(got.mean(0) - expected) < 0.07 * unit + 1e-5)
     np.testing.assert_allclose((got.std(0) / unit)[:6], 1, atol=0.07)  # the toy has spread along four directions
 
@@ -104,7 +104,7 @@ def test_more_steps_converge_and_a_key_decides(still):
 
 
 def test_eager_jit_and_vmap_agree(params):
-    state = flow_matching.wrap(params.chart, values(4))
+    state = flow_matching.to_state(params.chart, values(4))
     many = jax.tree.map(lambda x: jnp.stack([x, x]), state)
     batch = jax.vmap(flow_matching.velocity, (None, 0, None, 0, None, None))(
         params, many, 0.5, jnp.array([0, 1]), 2, POSE
@@ -138,14 +138,14 @@ def test_velocity_is_the_plain_loop(params):
         x = x + silu(x @ block["kernel"]) * (1 + context @ gate["kernel"]) / 2
     out = x @ weights["head"]["kernel"]
     v = scale * out[:9]
-    state = flow_matching.wrap(params.chart, values(8))
+    state = flow_matching.to_state(params.chart, values(8))
     got = flow_matching.velocity(params, state, jnp.float32(time), start, end, POSE)
     np.testing.assert_allclose(got[0][0, 0], v - (v @ y) * y, atol=2e-5)
     np.testing.assert_allclose(got[1], out[9:], rtol=1e-4, atol=1e-4)
 
 
 def test_gradients_equal_finite_differences_and_the_chart_has_none(params):
-    state = flow_matching.wrap(params.chart, values(4))
+    state = flow_matching.to_state(params.chart, values(4))
 
     @jax.jit
     def energy(params, state):
@@ -182,31 +182,33 @@ def test_the_flow_learns_both_styles(rank):
     """Two styles along the first direction, where the Gaussian that it starts from has one hump."""
     chart = fitted(toy(3000), labels=3, rank=rank)
     _, tangents, made, start, end, here = toy(3000)
-    real = jax.vmap(tangent_pca.coordinates, (None, 0, 0, 0, 0, 0))(chart, tangents, *made[1:], start, end)
-    poses = jax.vmap(tangent_pca.pose, (None, 0, 0))(chart, here, start)
+    real = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, 0, 0))(chart, tangents, *made[1:], start, end)
+    poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(chart, here, start)
     weights = flow_matching.init(jax.random.key(0), chart, config=CONFIG._replace(width=96, rank=rank)).weights
 
     def loss(weights, key, batch, chart):
         found, condition = batch
         a, b = jax.random.split(key)
         keys = jax.random.split(a, len(found))
-        source = jax.vmap(flow_matching.source, (None, 0, 0, 0, 0))(chart, keys, *condition)
-        target = jax.vmap(flow_matching.wrap, (None, 0))(chart, found)
+        source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
+        target = jax.vmap(flow_matching.to_state, (None, 0))(chart, found)
         unit = jax.vmap(flow_matching.unit, (None, 0, 0))(chart, *condition[:2])
-        field = lambda state, time, one: flow_matching.velocity(flow_matching.Params(chart, weights), state, time, *one)  # noqa: E731
+        field = lambda state, time, one: flow_matching.velocity(
+            flow_matching.FlowMatching(chart, weights), state, time, *one
+        )  # noqa: E731
         return losses.flow_matching(field, b, source, target, condition, unit), {}
 
     optimiser = optax.adam(optax.cosine_decay_schedule(3e-3, 2000))
-    step = loop.gathered(steps.supervised(loss, optimiser))
-    state = steps.start_supervised(weights, optimiser, jax.random.key(1))
+    step = loop.gather_batches(steps.supervised(loss, optimiser))
+    state = steps.init_supervised(weights, optimiser, jax.random.key(1))
     indices = loop.epoch_indices(0, len(real), 128)(0, 2000)
     held = ((real, (start, end, poses)), chart)
     state, _ = jax.jit(lambda s, i, h: jax.lax.scan(lambda s, b: step(s, b, h), s, i))(state, indices, held)
-    params = flow_matching.Params(chart, state.params)
+    params = flow_matching.FlowMatching(chart, state.params)
     keys = jax.random.split(jax.random.key(2), 1000)
     drawn = jax.vmap(flow_matching.sample, (None, 0, None, None, None))(params, keys, 1, 2, 0 * POSE)
     tangents = sphere.log(chart.p, drawn.q)
-    fake = jax.vmap(tangent_pca.coordinates, (None, 0, 0, 0, None, None))(chart, tangents, *drawn[1:], 1, 2)
+    fake = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, None, None))(chart, tangents, *drawn[1:], 1, 2)
     true = np.asarray(real[(start == 1) & (end == 2)])
     widest = 2 + int(np.argmax(true[:, 2:].std(0)))
     middle, deviation = true[:, widest].mean(), true[:, widest].std()

@@ -40,7 +40,7 @@ def test_the_type_of_the_parameters_decides(made, name):
     assert found.log_length.shape == found.log_seconds.shape == ()
     assert generators.kind(params) == name and type(params) is generators.KINDS[name]
     other = generators.sample(params, KEY, 1, 2, 0 * POSE, steps=2)
-    assert bool(np.any(other.q != found.q)) == generators.heeds_pose(params) == (name != "reference")
+    assert bool(np.any(other.q != found.q)) == generators.uses_start_pose(params) == (name != "reference")
     if name == "reference":
         np.testing.assert_array_equal(found.log_seconds, params.chart.scalar_mean[1, 2, 1])
 

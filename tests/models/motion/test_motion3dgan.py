@@ -87,7 +87,7 @@ def test_chart_directions_are_orthonormal_tangent_and_uncorrelated_within_pairs(
     np.testing.assert_allclose(basis @ p.ravel(), 0, atol=2e-6)
     components = tangents.reshape(len(tangents), -1) @ basis.T
     within, deviation = components.copy(), components.copy()
-    poses = np.stack([tangent_pca.pose(chart, h, a) for h, a in zip(here, start, strict=True)])
+    poses = np.stack([tangent_pca.encode_pose(chart, h, a) for h, a in zip(here, start, strict=True)])
     for a, b in {*zip(start.tolist(), end.tolist(), strict=True)}:
         rows = (start == a) & (end == b)
         np.testing.assert_allclose(chart.mean[a, b], components[rows].mean(0), atol=1e-5)
@@ -126,29 +126,31 @@ def test_coordinates_that_follow_the_pose_are_expected_to():
     """A direction of the start that moves the coordinates: regression finds it, and takes it out of the spread."""
     p, tangents, made, start, end, here = toy(1200)
     chart = fitted(toy(1200), labels=3, rank=8)
-    poses = jax.vmap(tangent_pca.pose, (None, 0, 0))(chart, here, start)
+    poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(chart, here, start)
     moved = tangents + 0.5 * np.asarray(poses)[:, 0, None, None, None] * np.asarray(chart.basis)[3]
     found = fitted((p, moved, made, start, end, here), labels=3, rank=8)
     along = np.einsum("rtlc,tlc->r", found.basis, chart.basis[3])
-    poses = jax.vmap(tangent_pca.pose, (None, 0, 0))(found, here, start)
+    poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(found, here, start)
     step = found.gain[1][0, tangent_pca.SCALARS :] @ along
     assert float(step) == pytest.approx(0.5, rel=0.08) and np.asarray(poses).std() == pytest.approx(0.8, abs=0.25)
-    before = tangent_pca.expected(found, 1, 2, jnp.zeros(CONFIG.pose))
+    before = tangent_pca.conditional_mean(found, 1, 2, jnp.zeros(CONFIG.pose))
     np.testing.assert_allclose(before[tangent_pca.SCALARS :], found.mean[1, 2], atol=1e-6)
     np.testing.assert_allclose(found.scale[1, 2][:3], chart.scale[1, 2][:3], rtol=0.2)
 
 
 def test_poses_are_inverse_and_neutral_has_only_one(chart):
     pose = jnp.asarray(np.random.default_rng(5).standard_normal(CONFIG.pose), jnp.float32)
-    np.testing.assert_allclose(tangent_pca.pose(chart, tangent_pca.unpose(chart, pose, 2), 2), pose, atol=1e-5)
-    np.testing.assert_array_equal(tangent_pca.pose(chart, jnp.ones(SHAPE[1:]), 0), 0)
-    np.testing.assert_array_equal(tangent_pca.unpose(chart, jnp.zeros(CONFIG.pose), 0), 0)
+    np.testing.assert_allclose(
+        tangent_pca.encode_pose(chart, tangent_pca.decode_pose(chart, pose, 2), 2), pose, atol=1e-5
+    )
+    np.testing.assert_array_equal(tangent_pca.encode_pose(chart, jnp.ones(SHAPE[1:]), 0), 0)
+    np.testing.assert_array_equal(tangent_pca.decode_pose(chart, jnp.zeros(CONFIG.pose), 0), 0)
 
 
 def test_coordinates_and_motion_are_inverse_and_keep_distances(chart):
     a, b = np.random.default_rng(0).standard_normal((2, CONFIG.rank + 2)).astype(np.float32)
-    (v, *scalars), (w, *_) = tangent_pca.motion(chart, a, 0, 1), tangent_pca.motion(chart, b, 0, 1)
-    np.testing.assert_allclose(tangent_pca.coordinates(chart, v, *scalars, 0, 1), a, atol=1e-5)
+    (v, *scalars), (w, *_) = tangent_pca.decode(chart, a, 0, 1), tangent_pca.decode(chart, b, 0, 1)
+    np.testing.assert_allclose(tangent_pca.encode(chart, v, *scalars, 0, 1), a, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(v - w), np.linalg.norm(a[2:] - b[2:]), rtol=1e-5)
 
 
@@ -258,7 +260,7 @@ def test_gradients_equal_finite_differences(generator):
 def test_critic_gradient_along_the_tangent_is_the_one_in_coordinates(critic):
     v, w = critic.chart.basis[0] * 0.3, jnp.float32(0.2)
     tangent = jax.grad(motion3dgan.critic.apply, 1)(critic, v, w, w, 0, 1, 0 * POSE)
-    values = tangent_pca.coordinates(critic.chart, v, w, w, 0, 1)
+    values = tangent_pca.encode(critic.chart, v, w, w, 0, 1)
     inner = jax.grad(motion3dgan.critic.inner, 1)(critic, values, 0, 1, 0 * POSE)
     np.testing.assert_allclose(np.linalg.norm(tangent), np.linalg.norm(inner[2:]), rtol=1e-5)
 
@@ -270,11 +272,11 @@ def test_wrong_charts_and_noise_are_named(chart, generator):
         motion3dgan.generator.apply(generator, jnp.zeros(7), 0, 1, POSE)
 
 
-def full_chart(labels: int) -> tangent_pca.Chart:
+def full_chart(labels: int) -> tangent_pca.TangentPCA:
     f = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
     square = labels, labels
     means = f(*square, 128), f(*square, 128), f(*square, 2), f(2), f(labels, 32, 130), f()
-    return tangent_pca.Chart(f(29, 68, 3), f(128, 29, 68, 3), *means, f(labels, 68, 3), f(32, 68, 3), f(32))
+    return tangent_pca.TangentPCA(f(29, 68, 3), f(128, 29, 68, 3), *means, f(labels, 68, 3), f(32, 68, 3), f(32))
 
 
 def test_the_default_networks_count_under_two_million_numbers():
@@ -321,21 +323,23 @@ def test_the_game_learns_spread_amplitude_and_both_styles():
     _, tangents, made, start, end, here = toy(3000)
     chart = fitted(toy(3000), labels=3, rank=8)
     scalars = made.log_length, made.log_seconds
-    real = jax.vmap(tangent_pca.coordinates, (None, 0, 0, 0, 0, 0))(chart, tangents, *scalars, start, end)
-    poses = jax.vmap(tangent_pca.pose, (None, 0, 0))(chart, here, start)
+    real = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, 0, 0))(chart, tangents, *scalars, start, end)
+    poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(chart, here, start)
     g, c = (n.init(k, chart, config=config).weights for n, k in zip(
         (motion3dgan.generator, motion3dgan.critic), jax.random.split(jax.random.key(0)), strict=True))  # fmt: skip
 
     def generate(weights, chart, key, pair):
-        return motion3dgan.generator.inner(motion3dgan.Params(chart, weights), jax.random.normal(key, (16,)), *pair)
+        return motion3dgan.generator.inner(
+            motion3dgan.Motion3DGAN(chart, weights), jax.random.normal(key, (16,)), *pair
+        )
 
     def score(weights, chart, values, pair):
-        return motion3dgan.critic.inner(motion3dgan.Params(chart, weights), values, *pair)
+        return motion3dgan.critic.inner(motion3dgan.Motion3DGAN(chart, weights), values, *pair)
 
     adam = optax.adam(optax.cosine_decay_schedule(1e-3, 2000), b1=0.5, b2=0.9)
     players = steps.Players(adam, optax.adam(1e-3, b1=0.5, b2=0.9))
-    step = loop.gathered(steps.adversarial(generate, score, players, decay=0.99))
-    state = steps.start_adversarial(steps.Players(g, c), players, jax.random.key(1))
+    step = loop.gather_batches(steps.adversarial(generate, score, players, decay=0.99))
+    state = steps.init_adversarial(steps.Players(g, c), players, jax.random.key(1))
     indices = loop.epoch_indices(0, len(real), 5 * 64)(0, 2000)
     held = ((real, (start, end, poses)), chart)
     state, _ = jax.jit(lambda s, i, h: jax.lax.scan(lambda s, b: step(s, b, h), s, i))(state, indices, held)
@@ -352,6 +356,6 @@ def test_the_game_learns_spread_amplitude_and_both_styles():
 def test_tangent_distance_of_the_loss_is_that_of_the_motions(chart):
     """Equation 6 in coordinates expanded through the basis equals the one on log-mapped motions."""
     a, b = np.random.default_rng(3).standard_normal((2, CONFIG.rank + 2)).astype(np.float32) * 0.1
-    v, w = tangent_pca.motion(chart, a, 0, 1)[0], tangent_pca.motion(chart, b, 0, 1)[0]
+    v, w = tangent_pca.decode(chart, a, 0, 1)[0], tangent_pca.decode(chart, b, 0, 1)[0]
     mapped = [sphere.log(chart.p, sphere.exp(chart.p, x)) for x in (v, w)]
     np.testing.assert_allclose(losses.tangent_l1(v, w), losses.tangent_l1(*mapped), rtol=1e-4)

@@ -10,7 +10,7 @@ from facejax.evaluation import vertex_error
 from facejax.inference import pipeline
 from facejax.training.recipes import fit_bundle, fit_gpmm, fit_motion, fit_residual
 
-PLANS = fit_bundle.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Plan(steps=2, batch=4))
+PLANS = fit_bundle.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.ResidualPlan(steps=2, batch=4))
 
 
 @pytest.fixture(scope="module")

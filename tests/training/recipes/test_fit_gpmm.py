@@ -25,7 +25,7 @@ def distance(found, expected):
 
 
 def test_all_priors_are_tried_and_the_best_is_carried(fitted):
-    wanted = {(kind, s, n) for kind in (False, True) for s in fit_gpmm.SMOOTH for n in fit_gpmm.NOISE}
+    wanted = {(kind, s, n) for kind in (False, True) for s in fit_gpmm.SMOOTHNESS_GRID for n in fit_gpmm.NOISE_GRID}
     assert {tuple(prior) for prior in fitted.errors_mm} == wanted
     # Expressions of the balls are made by deformation transfer.
     assert fitted.params.prior.carried
@@ -52,7 +52,7 @@ def test_what_is_fitted_is_the_model_of_all_meshes_under_that_prior(fitted, trai
     np.testing.assert_allclose(fitted.params.face, expected.face, rtol=1e-6)
     np.testing.assert_allclose(fitted.params.motion, expected.motion, rtol=1e-6)
     neutral, marks, vertices = of_split(ball_store, "test").person(1)
-    found, same = (np.asarray(linear.apply(gpmm.on_face(p, neutral), marks)) for p in (fitted.params, expected))
+    found, same = (np.asarray(linear.apply(gpmm.linear_map(p, neutral), marks)) for p in (fitted.params, expected))
     np.testing.assert_allclose(found, same, atol=1e-2)
     assert distance(found, vertices) < 0.1 * distance(0, vertices)
 

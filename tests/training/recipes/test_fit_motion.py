@@ -36,12 +36,12 @@ def known(data):
 
 @pytest.fixture(scope="module")
 def chart(known):
-    return transitions.chart_of(known, labels=4, rank=8, pose=4)
+    return transitions.fit_chart(known, labels=4, rank=8, pose=4)
 
 
 @pytest.fixture(scope="module")
 def examples(known, chart):
-    return transitions.examples_of(chart, [known.take(np.arange(36)), known.take(np.arange(36, 72))])
+    return transitions.encode_examples(chart, [known.take(np.arange(36)), known.take(np.arange(36, 72))])
 
 
 def test_examples_are_the_motions_in_the_chart(known, chart, examples):
@@ -62,12 +62,12 @@ def test_examples_are_the_motions_in_the_chart(known, chart, examples):
 
 def test_wrong_requests_are_named(known, chart, examples, tmp_path):
     with pytest.raises(ValueError, match="the highest label of the motions; got 2"):
-        transitions.chart_of(known, labels=2)
+        transitions.fit_chart(known, labels=2)
     with pytest.raises(ValueError, match="1 step or more, got 0"):
         fit_motion.fit_flow(examples, chart, tmp_path / "none", plan=fit_motion.FlowPlan(steps=0))
     assert not (tmp_path / "none").exists()
     for whole, parts in zip(
-        transitions.examples_of(chart, known), transitions.examples_of(chart, [known]), strict=True
+        transitions.encode_examples(chart, known), transitions.encode_examples(chart, [known]), strict=True
     ):
         np.testing.assert_array_equal(whole, parts)
 
@@ -81,14 +81,14 @@ def test_the_papers_set_has_the_papers_size():
     expected = np.where(np.eye(13), 0, 48)
     expected[0, 1:] = expected[1:, 0] = 12
     np.testing.assert_array_equal(pairs, expected)
-    assert augment.one_of_each(found.start, found.end).sum() == 132 + 24
+    assert augment.sample_per_pair(found.start, found.end).sum() == 132 + 24
 
 
 def test_coma_labels_are_13():
     """Of a dataset with more expressions than CoMA has; numbers follow the names given, not the dataset."""
     data = recorded(subjects=2, labels=("neutral", *performance.EXPRESSIONS[::-1]))
     names = ("neutral", *performance.COMA)
-    found = motions.join(*transitions.everything(data, "train", names=names, per_pair=1))
+    found = motions.join(*transitions.all_pairs(data, "train", names=names, per_pair=1))
     assert len(found.start) == 2 * 12 * 2 + 132
     assert {*found.start.tolist()} == {*found.end.tolist()} == {*range(13)}
     first = next(one for one in data.sequences if one.label == "bareteeth" and one.subject == 1)
@@ -99,7 +99,7 @@ def test_coma_labels_are_13():
 
 
 def test_everything_lets_everybody_meet_everybody(data):
-    parts = [*transitions.everything(data, "train", per_pair=None)]
+    parts = [*transitions.all_pairs(data, "train", per_pair=None)]
     assert [len(part.start) for part in parts] == [36, 6 * 36]
     counts = np.bincount(parts[1].subject, minlength=6)
     assert counts.tolist() == [36] * 6
@@ -116,7 +116,7 @@ def test_balanced_rows_hold_every_pair_equally_often():
 
 
 def test_extrinsic_mean_is_near_the_karcher_mean(known, chart):
-    other = transitions.chart_of(known, labels=4, rank=8, pose=4, mean="extrinsic")
+    other = transitions.fit_chart(known, labels=4, rank=8, pose=4, mean="extrinsic")
     cosine = float(np.sum(np.asarray(chart.p) * np.asarray(other.p))) / 29
     assert 0.5 < cosine < 1 - 1e-6
     # Of the two, the Karcher mean is the one about which the motions are centred.
@@ -124,7 +124,7 @@ def test_extrinsic_mean_is_near_the_karcher_mean(known, chart):
         known.start * 4 + known.end, minlength=16))) for one in (chart, other)]  # fmt: skip
     assert off[0] < 1e-3 < off[1]
     with pytest.raises(ValueError, match="mean: expected"):
-        transitions.chart_of(known, labels=4, mean="median")
+        transitions.fit_chart(known, labels=4, mean="median")
 
 
 def check(params, kind):
@@ -157,7 +157,7 @@ def test_terms_of_the_gan_are_those_of_the_motions(chart):
     found = fit_motion._terms(plan)(chart, fake, real, None)
     rows = []
     for a, b in zip(np.asarray(fake), np.asarray(real), strict=True):
-        (v, *s), (w, *t) = ([np.asarray(x, np.float64) for x in tangent_pca.motion(chart, x, 1, 2)] for x in (a, b))
+        (v, *s), (w, *t) = ([np.asarray(x, np.float64) for x in tangent_pca.decode(chart, x, 1, 2)] for x in (a, b))
         points = []
         for x in (v, w):
             angle = np.sqrt(np.sum(x**2) / 29)

@@ -13,8 +13,8 @@ from facejax.models.decoders import gpmm, gpmm_residual, linear, neural3dmm, res
 from facejax.training import loop, metric_logger
 from facejax.training.recipes import fit_gpmm, fit_neural3dmm, fit_residual
 
-PLAN = fit_residual.Plan(steps=80, batch=8)
-NEURAL = fit_neural3dmm.Plan(steps=20, batch=8)
+PLAN = fit_residual.ResidualPlan(steps=80, batch=8)
+NEURAL = fit_neural3dmm.Neural3DMMPlan(steps=20, batch=8)
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +112,14 @@ def test_the_gate_is_the_best_on_meshes_that_were_not_trained_on(refined, train,
     found, vertices = whole(fitted, train, answers, rows)
     errors = [distance(answers[rows] + g * (found - answers[rows]), vertices) for g in fit_residual.GATES]
     best = int(np.argmin(errors))
-    expected = fit_residual.GATES[best] if errors[best] < fit_residual.WORTH * errors[0] else 0.0
+    expected = fit_residual.GATES[best] if errors[best] < fit_residual.MIN_RELATIVE_GAIN * errors[0] else 0.0
     assert float(fitted.network.gate) == expected > 0
 
 
 def test_on_a_new_face_it_refines_the_linear_answer_and_with_a_closed_gate_is_that(refined, ball_store):
     _, fitted = refined
     neutral, marks, _ = of_split(ball_store, "test").person(1)
-    linear_answer = np.asarray(linear.apply(gpmm.on_face(fitted.base, neutral), marks))
+    linear_answer = np.asarray(linear.apply(gpmm.linear_map(fitted.base, neutral), marks))
     closed = fitted._replace(network=fitted.network._replace(gate=jnp.zeros(())))
     np.testing.assert_array_equal(gpmm_residual.apply(closed, marks, neutral), linear_answer)
     found = np.asarray(gpmm_residual.apply(fitted, marks, neutral))

@@ -38,7 +38,7 @@ def test_meshes_batch_select_and_fold(tiny_store):
 
 def test_decoder_learns_and_a_resumed_run_equals_an_uninterrupted_one(tiny_store, hierarchy, regions, tmp_path):
     train = of_split(tiny_store, "train")
-    plan = fit_s2d_dec.Plan(steps=60, batch=8, rate=2e-3)
+    plan = fit_s2d_dec.S2DDecPlan(steps=60, batch=8, rate=2e-3)
     whole = fit_s2d_dec.fit(train, hierarchy, tmp_path / "whole", plan=plan)
     again = fit_s2d_dec.fit(train, hierarchy, tmp_path / "whole", plan=plan)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
