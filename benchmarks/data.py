@@ -86,7 +86,7 @@ def _written(root: Path, config: Config) -> list[Path]:
 def _prepared(root: Path, count: int) -> _measure.Row:
     """By the command line in a process of its own; every call into a folder of its own."""
     np.savetxt(root / "landmarks.txt", np.linspace(0, 5000, 68).astype(int), fmt="%d")
-    command = [sys.executable, "-c", "from facejax.cli import main; main()", "data", "prepare", "folder"]
+    command = [sys.executable, "-c", "from facejax.cli.main import main; main()", "data", "prepare", "folder"]
     command += ["--root", root / "raw", "--landmarks", root / "landmarks.txt", "--unit", "mm"]
     calls = iter(range(10**9))
 

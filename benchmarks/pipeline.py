@@ -29,8 +29,9 @@ from facejax.models.decoders import gpmm, s2d_dec
 LABELS, FRAMES = ["neutral", "high_smile"], 30
 FRESH = """
 import jax
-from facejax import pipeline, runtime
-runtime.start()
+from facejax.cli import runtime
+from facejax.inference import pipeline
+runtime.configure()
 models = pipeline.load()
 landmarks = pipeline.landmarks(models, jax.random.key(0), ["neutral", "high_smile"], models.face.vertices)
 jax.block_until_ready(pipeline.meshes(models, landmarks, models.face.vertices))

@@ -1,8 +1,8 @@
-"""What all experiments share: flags, the output folder, and the record of how a result was made.
+"""Command line, output files and provenance record of all experiments.
 
 An experiment has a frozen `Config` with `out`, `seed` and `publish`, and `run(config) -> metrics`. It writes
-`runs/NAME/{config.json, metrics.json, table.md, *.png}`; with `--publish` the figures that the README quotes go to
-`experiments/results/NAME.{json,md,png}` as well.
+`runs/NAME/{config.json, metrics.json, table.md, *.png}`; with `--publish` also the committed results,
+`experiments/results/NAME.{json,md,png}`, which the README quotes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -24,15 +23,19 @@ import numpy as np
 import tyro
 
 from facejax.cli import runtime
+from facejax.evaluation import run_record
 from facejax.io import atomic
 
-PREPARES = "The first run prepares makehuman4d in the user's cache: some 4 minutes and 0.8 GB a level."
+PREPARES = "The first run prepares makehuman4d in the user's cache: about 4 minutes and 0.8 GB per level."
 RESULTS = Path(__file__).parent / "results"
 Config = TypeVar("Config")
 
 
 def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str, Any]]) -> None:
-    """Parse the command line, run, and say where the results are. Bad input: one line, exit code 2."""
+    """Parse the command line, run the experiment and print its output folder.
+
+    Invalid input ends with a one-line message on standard error and exit code 2.
+    """
     description = sys.modules[run.__module__].__doc__
     if "meshes" in {field.name for field in dataclasses.fields(config_type)}:
         description += f"\n{PREPARES}"
@@ -48,22 +51,22 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
 
 
 def _check_publish(config: Any) -> None:
-    """What the README quotes is of the full experiment on the embedded data."""
+    """Raise `ValueError` where `--publish` is combined with options that shrink or change the experiment."""
     wrong = ["data", "first", "second", "speech", "quick"] + ["folds"] * (not getattr(config, "paper", False))
     given = [name for name in wrong if getattr(config, name, None)]
     if getattr(config, "publish", False) and given:
-        raise ValueError(f"--publish writes what the README quotes: leave out --{', --'.join(given)}")
+        raise ValueError(f"--publish needs the full experiment on makehuman4d: leave out --{', --'.join(given)}")
 
 
 def record(config: Any, *, seconds: float, dataset: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Command, commit, machine, seed, seconds and dataset version of a result."""
+    """Return the provenance of a result: command, commit, machine, seed, seconds, date and dataset."""
     module = sys.modules["__main__"].__spec__
     command = ["python", "-m", module.name] if module else ["python", Path(sys.argv[0]).name]
     return {
         "command": shlex.join(command + sys.argv[1:]),
-        "commit": _commit(),
+        "commit": run_record.commit(RESULTS.parent) or "unknown",
         "machine": {
-            "processor": _processor(),
+            "processor": run_record.processor(),
             "cores": os.cpu_count(),
             "device": jax.devices()[0].device_kind,
             "python": platform.python_version(),
@@ -87,9 +90,9 @@ def finish(
     table: str,
     figure: Path | None = None,
 ) -> None:
-    """Write the config, the metrics with their record, and the table; publish them if asked.
+    """Write the config, the metrics with their provenance, and the table; with `--publish` the committed results too.
 
-    What the paper's 300 epochs gave is published beside the experiment's own figures, as NAME-paper.
+    Results of a run with `--paper` are published as NAME-paper, beside those of the default run.
     """
     out = Path(config.out)
     document = {**metrics, "made": made}
@@ -103,12 +106,27 @@ def finish(
         write_text(RESULTS / f"{name}.json", json.dumps(document, indent=1, default=_plain) + "\n")
         write_text(RESULTS / f"{name}.md", body)
         if figure is not None:
-            with atomic.replace_file(RESULTS / f"{name}{figure.suffix}") as temporary:
-                temporary.write_bytes(figure.read_bytes())
+            publish_file(figure, f"{name}{figure.suffix}")
+
+
+def publish_file(path: Path, name: str) -> None:
+    """Copy a file into `experiments/results` under the given name."""
+    with atomic.replace_file(RESULTS / name) as temporary:
+        temporary.write_bytes(path.read_bytes())
+
+
+def save_figure(figure: Any, path: Path, *, dpi: int = 110) -> Path:
+    """Write a matplotlib figure as PNG, close it, and return the path."""
+    from matplotlib import pyplot
+
+    with atomic.replace_file(path) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")
+    pyplot.close(figure)
+    return path
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A Markdown table; numbers to three significant decimals."""
+    """Return a Markdown table; floats with three decimals."""
 
     def cell(value: Any) -> str:
         return f"{value:.3f}" if isinstance(value, float) else str(value)
@@ -118,29 +136,10 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file as a whole or not at all."""
+    """Write a text file atomically."""
     with atomic.replace_file(path) as temporary:
         temporary.write_text(text)
 
 
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
-
-
-def _commit() -> str:
-    done = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],
-        capture_output=True,
-        text=True,
-        cwd=RESULTS.parent,
-        check=False,
-    )
-    return done.stdout.strip() or "unknown"
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import _judged, _recognised, _run
+from experiments import _motion_eval, _run, _transition_classifier
 from facejax.data import motions, transitions
 from facejax.data.synthetic import makehuman4d
 
@@ -32,7 +32,7 @@ PAPER = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_judged.Options):
+class Config(_motion_eval.Options):
     out: Path = Path("runs/classification")
     """Folder for the results."""
     trees: int = 300
@@ -42,27 +42,27 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Train the forest, generate, judge."""
     begun = time.perf_counter()
-    judged = _judged.models_of(config)
-    data = _judged.data_of(config)
-    names = _judged.names_of(data)
-    real = _judged.held(config, "test", names)
-    forest = _recognised.forest(config, names, config.trees)
+    judged = _motion_eval.models_of(config)
+    data = _motion_eval.data_of(config)
+    names = _motion_eval.names_of(data)
+    real = _motion_eval.held(config, "test", names)
+    forest = _transition_classifier.forest(config, names, config.trees)
     shares = []
     for models in judged:
-        drawn = _judged.drawn(models, real, samples=config.samples, seed=config.seed)
-        shares.append(_recognised.recognised(forest, drawn, real.scale))
+        drawn = _motion_eval.drawn(models, real, samples=config.samples, seed=config.seed)
+        shares.append(_transition_classifier.recognised(forest, drawn, real.scale))
     each = np.mean(shares, axis=0)
     metrics = {
         "accuracy_generated": float(np.mean(shares)),
         "accuracy_generated_each": np.mean(shares, axis=1).tolist(),
         "accuracy_real": _accuracy(forest, _selected(config), real.pairs),
-        "accuracy_unselected": float(np.mean(_recognised.recognised(forest, real.curves, real.scale))),
+        "accuracy_unselected": float(np.mean(_transition_classifier.recognised(forest, real.curves, real.scale))),
         "accuracy_paper_on_coma": float(np.mean(PAPER)) / 100,
         "per_transition": {f"{a}>{b}": float(score) for (a, b), score in zip(names, each, strict=True)},
         "people": real.people,
     }
     if any(">" in sequence.label for sequence in data.sequences):
-        metrics["accuracy_direct"] = _accuracy(forest, motions.directs(data, "test"), real.pairs)
+        metrics["accuracy_direct"] = _accuracy(forest, motions.direct_transitions(data, "test"), real.pairs)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("classification", config, metrics, made=made, table=_table(config, metrics, len(judged)))
     return metrics
@@ -70,16 +70,16 @@ def run(config: Config) -> dict[str, Any]:
 
 def _selected(config: Config) -> motions.Motions:
     """The forest's own construction, of held-out people."""
-    halves = _judged.halves_of(config, "test")
+    halves = _motion_eval.halves_of(config, "test")
     onsets = halves.take(halves.start == 0)
-    count = len(_judged.data_of(config).labels)
-    chosen = motions.interpolated(onsets, count, per_pair=transitions.PER_PAIR, reuse=1)
+    count = len(_motion_eval.data_of(config).labels)
+    chosen = motions.interpolated_transitions(onsets, count, per_pair=transitions.TRANSITIONS_PER_PAIR, reuse=1)
     return motions.join(halves, *chosen)
 
 
-def _accuracy(forest, found: motions.Motions, pairs: list[_judged.Pair]) -> float:
+def _accuracy(forest, found: motions.Motions, pairs: list[_motion_eval.Pair]) -> float:
     """Over motions; pairs of neutral have as many as there are people, as when the forest was trained."""
-    mine, which = _recognised.labelled(found, pairs)
+    mine, which = _transition_classifier.labelled(found, pairs)
     return float(np.mean(forest.predict(mine.curves.reshape(len(which), -1)) == which))
 
 
@@ -95,7 +95,7 @@ def _table(config: Config, metrics: dict[str, Any], models: int) -> str:
     table = _run.markdown((f"{len(metrics['per_transition'])} transitions", "accuracy"), rows)
     worst = sorted(metrics["per_transition"].items(), key=lambda item: item[1])[:6]
     table += "\n\nHardest: " + ", ".join(f"{name} {score:.0%}" for name, score in worst) + "."
-    paper = {f"{a}>{b}": f"{share} %" for (a, b), share in zip(makehuman4d.PAIRS, PAPER, strict=True)}
+    paper = {f"{a}>{b}": f"{share} %" for (a, b), share in zip(makehuman4d.TABLE5_PAIRS, PAPER, strict=True)}
     each = metrics["per_transition"].items()
     rows = [(*name.split(">"), f"{score:.0%}", paper.get(name, "")) for name, score in each]
     each = _run.markdown(("start", "end", "generated", "OT23 on CoMA"), rows)

@@ -22,9 +22,9 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _judged, _run
+from experiments import _datasets, _motion_eval, _run
 from facejax import metrics
-from facejax.data.synthetic import performance
+from facejax.data.synthetic import expression_recipes
 from facejax.inference import composition, pipeline
 from facejax.io import atomic
 from facejax.viz import contact_sheet, eyes_teeth, render
@@ -45,7 +45,7 @@ FRAMES = 30
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_judged.Options):
+class Config(_motion_eval.Options):
     out: Path = Path("runs/composed")
     """Folder for the results."""
     chains: int = 8
@@ -55,12 +55,12 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Compose, and measure along the way."""
     begun = time.perf_counter()
-    judged = _judged.models_of(config)
-    data = _judged.data_of(config)
+    judged = _motion_eval.models_of(config)
+    data = _motion_eval.data_of(config)
     chains = random_chains(config.chains, config.seed, data.labels)
-    five = FIVE if _cases.is_makehuman(data) else random_chains(5, config.seed + 1, data.labels, transitions=3)
+    five = FIVE if _datasets.is_makehuman(data) else random_chains(5, config.seed + 1, data.labels, transitions=3)
     steps = {pair for labels in (*five, *chains) for pair in zip(labels[:-1], labels[1:], strict=True)}
-    real = _judged.held(config, "test", sorted(steps))
+    real = _motion_eval.held(config, "test", sorted(steps))
     of = {name: i for i, name in enumerate(real.names)}
     rows, errors = [], []
     for models in judged:
@@ -95,7 +95,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def random_chains(
-    count: int, seed: int, labels: Sequence[str] = performance.LABELS, *, transitions: int = TRANSITIONS
+    count: int, seed: int, labels: Sequence[str] = expression_recipes.LABELS, *, transitions: int = TRANSITIONS
 ) -> list[tuple[str, ...]]:
     """Chains of so many transitions, neutral (the first label) first and last, in which no label follows itself."""
     random = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def random_chains(
     return chains
 
 
-def _errors(models: pipeline.Models, config: Config, labels, real: _judged.Held, of: dict) -> np.ndarray:
+def _errors(models: pipeline.Models, config: Config, labels, real: _motion_eval.Held, of: dict) -> np.ndarray:
     """Mean distance (T,) to the held-out sample of each transition in turn."""
     key = jax.random.key(config.seed)
     drawn = real.scale * np.asarray(pipeline.displacements(models, key, labels, samples=config.samples))
@@ -121,7 +121,7 @@ def _errors(models: pipeline.Models, config: Config, labels, real: _judged.Held,
 
 
 def _chain(
-    models: pipeline.Models, config: Config, number: int, labels, real: _judged.Held, of: dict
+    models: pipeline.Models, config: Config, number: int, labels, real: _motion_eval.Held, of: dict
 ) -> dict[str, Any]:
     """One chain: distance of every transition to the nearest real one, the end, and the joints."""
     pairs = list(zip(labels[:-1], labels[1:], strict=True))

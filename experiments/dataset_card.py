@@ -20,10 +20,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _run
+from experiments import _datasets, _run
 from facejax.data import dataset
 from facejax.data.mesh_subset import of_split
-from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
+from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d, performance, rig
 from facejax.evaluation import vertex_error
 from facejax.inference import makehuman_portrait
 from facejax.io import atomic
@@ -88,7 +88,7 @@ def _counts(data: dataset.Dataset) -> dict[str, Any]:
     direct = sum(">" in s.label for s in data.sequences)
     at, owner = data.meshes("test")
     moved = np.linalg.norm(data.vertices[at] - data.neutral[owner], axis=-1)
-    mask = _cases.regions_of(data)["face"]
+    mask = _datasets.regions_of(data)["face"]
     return {
         "subjects": {split: len(data.subjects(split)) for split in dataset.SPLITS},
         "sequences": len(data.sequences) - direct,
@@ -102,11 +102,11 @@ def _counts(data: dataset.Dataset) -> dict[str, Any]:
 
 def _linear_errors(data: dataset.Dataset) -> dict[str, Any]:
     """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on a fourth of them that is unseen."""
-    regions = _cases.regions_of(data)
+    regions = _datasets.regions_of(data)
     train, test = of_split(data, "train"), of_split(data, "test")
     splits = {"subjects": [(train, test)], "expressions": []}
-    names = performance.COMA if _cases.is_makehuman(data) else sorted(set(test.labels))
-    for held in np.array_split(names, min(_cases.FOLDS, len(names))):
+    names = expression_recipes.COMA if _datasets.is_makehuman(data) else sorted(set(test.labels))
+    for held in np.array_split(names, min(_datasets.FOLDS, len(names))):
         splits["expressions"].append((train.of_labels(held, without=True), test.of_labels(held)))
     found: dict[str, Any] = {}
     for split, folds in splits.items():
@@ -153,14 +153,14 @@ def _sheet(path: Path, config: Config) -> None:
     rows = []
     for index in SHOWN:
         posed = rig.build(makehuman.subject(index, seed=config.seed), level=3)
-        peaks = [performance.peak(label, index, seed=config.seed) for label in performance.EXPRESSIONS]
+        peaks = [performance.apex_weights(label, index, seed=config.seed) for label in expression_recipes.EXPRESSIONS]
         rows.append([_portrait(vertices) for vertices in rig.pose(posed, np.stack(peaks))])
     people = [makehuman.subject(i, seed=config.seed) for i in SHOWN]
     names = [f"{p.name}, {p.age:.0f}" for p in people]
-    half = len(performance.EXPRESSIONS) // 2
+    half = len(expression_recipes.EXPRESSIONS) // 2
     sheets = [
         render.contact_sheet(
-            [row[part] for row in rows], row_labels=names, column_labels=list(performance.EXPRESSIONS[part])
+            [row[part] for row in rows], row_labels=names, column_labels=list(expression_recipes.EXPRESSIONS[part])
         )
         for part in (slice(0, half), slice(half, None))
     ]
@@ -189,7 +189,7 @@ def _farthest(path: Path, data: dataset.Dataset) -> None:
 def _ladder(path: Path, config: Config) -> None:
     """Four expressions of one subject on every level, and at rest."""
     labels = ("neutral", "high_smile", "disgust", "mouth_extreme", "eyebrow", "mouth_up")
-    weights = np.stack([performance.peak(label, SHOWN[2], seed=config.seed) for label in labels])
+    weights = np.stack([performance.apex_weights(label, SHOWN[2], seed=config.seed) for label in labels])
     person = makehuman.subject(SHOWN[2], seed=config.seed)
     rows = [[_portrait(v) for v in rig.pose(rig.build(person, level=level), weights)] for level in rig.LEVELS]
     names = [f"level {level}" for level in rig.LEVELS]

@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import _cases, _run, _scored
+from experiments import _datasets, _lstm_report, _run
 from facejax.cli import runtime
 from facejax.data import dataset, sequences
-from facejax.data.synthetic import makehuman4d, performance
+from facejax.data.synthetic import expression_recipes, makehuman4d
 from facejax.evaluation import expression_error
 from facejax.inference import expressions
 from facejax.io import atomic
@@ -118,13 +118,15 @@ def run(config: Config) -> dict[str, Any]:
     networks = networks._replace(about={"made": made, "variant": name, "plan": variant.plan._asdict(), "test": judged})
     for path in [config.out / expressions.RELEASED] + [PACKAGED] * config.release:
         expressions.save(path, networks)
-    figure = _scored.plot(config.out / "expression_lstm.png", judged)
+    figure = _lstm_report.plot(config.out / "expression_lstm.png", judged)
     shown = expressions.load(config.out / expressions.RELEASED)
-    _scored.sheet(config.out / "sheet.png", shown, None if config.data is None else dataset.open_dataset(config.data))
+    _lstm_report.sheet(
+        config.out / "sheet.png", shown, None if config.data is None else dataset.open_dataset(config.data)
+    )
     if config.publish:
         with atomic.replace_file(_run.RESULTS / "expression_lstm_sheet.png") as temporary:
             temporary.write_bytes((config.out / "sheet.png").read_bytes())
-    text = f"Chosen: {name}.\n\n{_scored.test_table(judged)}\n\n{_scored.variants_table(table, seconds)}"
+    text = f"Chosen: {name}.\n\n{_lstm_report.test_table(judged)}\n\n{_lstm_report.variants_table(table, seconds)}"
     _run.finish("expression_lstm", config, metrics, made=made, table=text, figure=figure)
     return metrics
 
@@ -136,13 +138,13 @@ def chosen(table: dict[str, dict[str, dict[str, float]]]) -> str:
     """
 
     def bound(name):
-        ratios = [_scored.ratios(row) for row in table[name].values()]
+        ratios = [_lstm_report.ratios(row) for row in table[name].values()]
         still = all(MOTION[0] <= ratio[key] <= MOTION[1] for ratio in ratios for key in ("energy", "acceleration"))
         return still and all(ratio["whole"] <= WHOLE for ratio in ratios)
 
     names = [name for name in table if VARIANTS[name].head == "none"] or list(table)
     within = [name for name in names if bound(name)] or names
-    return min(within, key=lambda name: np.mean([_scored.ratios(row)["rest"] for row in table[name].values()]))
+    return min(within, key=lambda name: np.mean([_lstm_report.ratios(row)["rest"] for row in table[name].values()]))
 
 
 def train(config: Config, name: str) -> expression_lstm.ExpressionLSTM:
@@ -167,16 +169,16 @@ def recordings(config: Config, variant: Variant, split: str) -> sequences.Sequen
     if split in MORE:
         spec = _spec(config, variant)._replace(meshes=min(config.meshes, config.subjects), seed=MORE[split])
         people = makehuman4d.prepare(spec)
-        found = sequences.join(*(sequences.read(people, part, performance.EMOTIONS) for part in dataset.SPLITS))
+        found = sequences.join(*(sequences.read(people, part, expression_recipes.EMOTIONS) for part in dataset.SPLITS))
     else:
         data = _dataset(config, variant)
         found = sequences.read(data, split, labels_of(data))
-    return sequences.without_head_motion(found) if variant.head == "removed" else found
+    return sequences.remove_head_motion(found) if variant.head == "removed" else found
 
 
 def labels_of(data: dataset.Dataset) -> tuple[str, ...]:
     """What there is a network for: the six emotions, or all expressions of a dataset of the user's own."""
-    return performance.EMOTIONS if _cases.is_makehuman(data) else data.labels[1:]
+    return expression_recipes.EMOTIONS if _datasets.is_makehuman(data) else data.labels[1:]
 
 
 def folder(config: Config, name: str) -> Path:
@@ -207,12 +209,12 @@ def scores(
         number = data.labels.index(label)
         parts = (held_out.take(held_out.label == number), train.take(train.label == number))
         network, start = fit_expression_lstm.network(params, i), variant.config.start
-        found[label] = expression_error.expression_scores(network, *parts, start=start, prefix=_scored.PREFIX)
+        found[label] = expression_error.expression_scores(network, *parts, start=start, prefix=_lstm_report.PREFIX)
     return found
 
 
 def _networks(config: Config, variant: Variant, params: expression_lstm.ExpressionLSTM) -> expressions.Expressions:
-    frames, data = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL, _dataset(config, variant)
+    frames, data = recordings(config, variant, "train").curves.shape[1] + sequences.TAIL_FRAMES, _dataset(config, variant)
     return expressions.Expressions(labels_of(data), params, variant.config, float(data.index["rate"]), frames, {})
 
 

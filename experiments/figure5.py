@@ -15,7 +15,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 from facejax.evaluation import vertex_error
 
 matplotlib.use("Agg")
@@ -26,7 +26,7 @@ SHOWN = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # mm
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/figure5")
     """Folder for the results."""
     runs: Path = Path("runs/table1")
@@ -44,24 +44,24 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """The share of vertices below each distance, per split, region and method."""
     mode = config.mode
-    _dense.check_methods(config.methods)
-    data = _cases.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+    _mesh_eval.check_methods(config.methods)
+    data = _datasets.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _datasets.regions_of(data), _datasets.hierarchy_of(data)
     curves, seconds = [], 0.0
     for split in config.splits:
         for name in config.methods:
             parts = [
-                _dense.judge(
+                _mesh_eval.judge(
                     name,
                     case,
                     config.folder(config.runs),
-                    _dense.options_of(case, mode, config.seed, hierarchy),
+                    _mesh_eval.options_of(case, mode, config.seed, hierarchy),
                     regions,
                 )[0.0]
-                for case in _cases.cases(data, [split])
+                for case in _datasets.cases(data, [split])
             ]
             seconds += sum(part.seconds for part in parts)
-            shares = _dense.pooled(parts).cumulative()
+            shares = _mesh_eval.pooled(parts).cumulative()
             for region, share in zip(regions, shares, strict=True):
                 curves.append({"split": split, "method": name, "region": region, "share": share.round(5).tolist()})
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"])
@@ -86,7 +86,7 @@ def _table(curves, regions, config: Config) -> str:
                 both = [np.interp(np.log(limit), np.log(vertex_error.EDGES), _share(curves, split, method, region))
                         for region in regions]  # fmt: skip
                 cells.append(" / ".join(f"{share:.1%}" for share in both))
-            body.append((_dense.NAMES[method], *cells))
+            body.append((_mesh_eval.NAMES[method], *cells))
         header = (f"{split} split, head / face", *(f"below {limit:g} mm" for limit in SHOWN))
         parts.append(_run.markdown(header, body))
     return "\n\n".join(parts)
@@ -103,12 +103,12 @@ def _plot(path: Path, curves, regions: list[str], config: Config) -> Path:
             for method in config.methods:
                 style = "--" if method in ("ridge", "gpmm") else "-"
                 axis.plot(vertex_error.EDGES, _share(curves, split, method, region), style, color=colours[method],
-                          label=_dense.NAMES[method])  # fmt: skip
+                          label=_mesh_eval.NAMES[method])  # fmt: skip
             axis.set(xscale="log", xlim=(2e-3, 3), ylim=(0, 1), title=f"{split} split, {region}", xlabel="mm")
             axis.grid(alpha=0.3)
         line[0].set_ylabel("share of vertices nearer than")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

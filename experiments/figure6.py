@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 from facejax.evaluation import baselines
 from facejax.viz import render
 
@@ -27,7 +27,7 @@ PICTURE = (170, 214)
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/figure6")
     """Folder for the results."""
     runs: Path = Path("runs/table1")
@@ -45,16 +45,16 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """A sheet: one row per face, the truth and then each method; and each one's mean error."""
     mode, begun = config.mode, time.perf_counter()
-    _dense.check_methods(config.methods)
-    data = _cases.data_of(config.data, mode, level=config.level)
-    case = _cases.cases(data, ["identity"])[0]
-    options = _dense.options_of(case, mode, config.seed, _cases.hierarchy_of(data))
+    _mesh_eval.check_methods(config.methods)
+    data = _datasets.data_of(config.data, mode, level=config.level)
+    case = _datasets.cases(data, ["identity"])[0]
+    options = _mesh_eval.options_of(case, mode, config.seed, _datasets.hierarchy_of(data))
     chosen = _strongest(case.test)
     true = [_true(case.test, row) for row in chosen]
     columns = [[_face(data, vertices) for vertices in true]]
     rows = []
     for name in config.methods:
-        fitted = _dense.fitted(name, case, config.folder(config.runs), options)
+        fitted = _mesh_eval.fitted(name, case, config.folder(config.runs), options)
         column = []
         for row, vertices in zip(chosen, true, strict=True):
             rest = np.asarray(data.neutral[case.test.owner[row]])
@@ -68,7 +68,7 @@ def run(config: Config) -> dict[str, Any]:
     sheet = render.contact_sheet(
         [list(line) for line in zip(*columns, strict=True)],
         row_labels=[str(case.test.labels[row]) for row in chosen],
-        column_labels=["true", *(_dense.NAMES[name] for name in config.methods)],
+        column_labels=["true", *(_mesh_eval.NAMES[name] for name in config.methods)],
     )
     path = config.out / "figure6.png"
     render.save(path, sheet)
@@ -107,7 +107,7 @@ def _table(rows, config: Config) -> str:
     for name in config.methods:
         mine = {row["label"]: row for row in rows if row["method"] == name}
         cells = ["{mean_mm:.4f} / {largest_mm:.2f}".format(**mine[label]) for label in labels]
-        body.append((_dense.NAMES[name], *cells))
+        body.append((_mesh_eval.NAMES[name], *cells))
     return _run.markdown(("mm, mean / largest", *labels), body)
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments import _judged, _run, _transferred
+from experiments import _motion_eval, _motion_transfer, _run
 from facejax import io
 from facejax.cli import outputs
 from facejax.data import dataset
@@ -85,12 +85,14 @@ def run(config: Config) -> dict[str, Any]:
     labels.append("source")
     errors, everywhere = [], np.ones(len(source.rest), bool)
     for i, take in enumerate(targets):
-        marks = (take.rest[index] + _transferred.onto(source, take, index)).astype(np.float32)
+        marks = (take.rest[index] + _motion_transfer.onto(source, take, index)).astype(np.float32)
         vertices = np.asarray(pipeline.meshes(models, marks, take.rest))
         films[f"transfer{i + 1}"] = take, vertices, marks
         labels.append(f"on {take.name}")
         still = np.broadcast_to(take.rest, vertices.shape)
-        mean, at_rest = (float(_transferred.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still))
+        mean, at_rest = (
+            float(_motion_transfer.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still)
+        )
         errors.append({"target": take.name, "mean_mm": mean, "still_mm": at_rest})
     outputs.make_output_folder(config.out)
     rows = []
@@ -108,7 +110,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _performed(config: Config, models: pipeline.Models) -> list[_transferred.Take]:
+def _performed(config: Config, models: pipeline.Models) -> list[_motion_transfer.Take]:
     """Three of MakeHuman's people under the recording, or as the third of them performs."""
     index = np.asarray(models.face.landmark_index)
     numbers = config.people or PEOPLE
@@ -121,25 +123,25 @@ def _performed(config: Config, models: pipeline.Models) -> list[_transferred.Tak
     people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]
     if config.recording is not None:
         take = motion_sources.read_recording(config.recording, begin=config.begin, seconds=config.seconds)
-        return [_transferred.posed(take, person, index) for person in people]
+        return [_motion_transfer.posed(take, person, index) for person in people]
     takes = [performance.perform(label, numbers[2], seed=makehuman4d.SEED).weights for label in PERFORMED]
     weights, found = np.concatenate(takes), []
     for person in people:
         skin = rig.pose(rig.build(person, level=motion_sources.LEVEL), weights)[:, : len(person.vertices)]
-        found.append(_transferred.of_skin(skin, person, index))
+        found.append(_motion_transfer.of_skin(skin, person, index))
     return found
 
 
-def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_transferred.Take]]:
+def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_motion_transfer.Take]]:
     """Two chains of a dataset's labels, and one label's recordings of three people."""
     data = dataset.open_meshes(config.data)
-    _judged.fits(models, data, config.model or "the released models")
+    _motion_eval.fits(models, data, config.model or "the released models")
     held = np.concatenate([data.subjects(split) for split in ("test", "validation", "train")])
     numbers = list(config.people or held[:3].tolist())
     if len(numbers) != 3 or not set(numbers) <= set(held.tolist()):
         raise ValueError(f"--people: expected three of {data.path}'s {len(held)} people, got {numbers}")
     for label in data.labels[1:]:
-        takes = [_transferred.stored(data, number, label) for number in numbers]
+        takes = [_motion_transfer.stored(data, number, label) for number in numbers]
         if None not in takes:
             rng = np.random.default_rng(config.seed)
             names = [rng.permutation(data.labels[1:])[:4].tolist() for _ in CHAINS]

@@ -23,7 +23,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _judged, _recognised, _run
+from experiments import _motion_eval, _run, _transition_classifier
 from facejax.data import motions, transitions
 from facejax.inference import pipeline
 from facejax.models.motion import flow_matching, motion3dgan_reference
@@ -48,7 +48,7 @@ BOUNDS = {"accuracy": 0.03, "specificity": 1.1, "diversity": (0.8, 1.2), "accele
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_judged.People):
+class Config(_motion_eval.People):
     out: Path = Path("runs/generators")
     """Folder for checkpoints, weights and results."""
     seed: int = 0
@@ -75,9 +75,9 @@ def run(config: Config) -> dict[str, Any]:
     unknown = [name for name in config.variants if name not in VARIANTS]
     if unknown:
         raise ValueError(f"--variants: unknown {_quoted(unknown)}; there are {_quoted(VARIANTS)}")
-    data = _judged.data_of(config)
+    data = _motion_eval.data_of(config)
     lent = pipeline.load(config.model)
-    _judged.fits(lent, data, config.model or "the released models")
+    _motion_eval.fits(lent, data, config.model or "the released models")
     examples = functools.cache(lambda source: _examples(data, source))
     judge = functools.cache(lambda: _judge(config))
     for name in config.variants:
@@ -105,7 +105,12 @@ def run(config: Config) -> dict[str, Any]:
     figure = _plot(config.out, table, real)
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish(
-        "generators", config, metrics, made=made, table=_table(table, real, len(_judged.names_of(data))), figure=figure
+        "generators",
+        config,
+        metrics,
+        made=made,
+        table=_table(table, real, len(_motion_eval.names_of(data))),
+        figure=figure,
     )
     return metrics
 
@@ -145,7 +150,7 @@ def _examples(data, source: str) -> tuple[motions.Motions, Any, transitions.Exam
         known = transitions.transitions(data, "train")
         chart = transitions.fit_chart(known, labels=labels, rank=transitions.default_rank(known))
         return known, chart, transitions.encode_examples(chart, [known])
-    known = motions.join(*transitions.all_pairs(data, "train", per_pair=transitions.CHARTED))
+    known = motions.join(*transitions.all_pairs(data, "train", per_pair=transitions.CHART_PER_PAIR))
     chart = transitions.fit_chart(known, labels=labels, rank=transitions.default_rank(known))
     return known, chart, transitions.encode_examples(chart, transitions.all_pairs(data, "train"))
 
@@ -172,7 +177,7 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
         plan = fit_motion.REFERENCE._replace(steps=config.reference_steps, batch=config.reference_batch)
         eighth = motion3dgan_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
-    beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
+    beginnings = transitions.fit_start_poses(chart, motions.halves(data, "train"))
     models = lent._replace(motion=generator, starts=beginnings)
     # Of the steps alone, over all runs that it took: compiling and preparing are the same for all.
     seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in metric_logger.read(folder))
@@ -182,18 +187,18 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
 
 def _judge(config: Config):
     """A function from models, or None for real people, to the mean figures on validation people."""
-    names = _judged.names_of(_judged.data_of(config))
-    real = _judged.held(config, "validation", names)
-    train = _judged.seen(config, real.pairs, real.scale, 3 * transitions.CHARTED)
-    forest = _recognised.forest(config, names)
+    names = _motion_eval.names_of(_motion_eval.data_of(config))
+    real = _motion_eval.held(config, "validation", names)
+    train = _motion_eval.seen(config, real.pairs, real.scale, 3 * transitions.CHART_PER_PAIR)
+    forest = _transition_classifier.forest(config, names)
 
     def judge(models: pipeline.Models | None) -> dict[str, Any]:
-        found = _judged.ceiling(real)
+        found = _motion_eval.ceiling(real)
         if models is not None:
             count = max(len(curves) for curves in found)
-            found = _judged.drawn(models, real, samples=count, seed=config.seed)
-        means = _judged.mean_of(_judged.scores(found, real, train))
-        return means | {"accuracy": float(np.mean(_recognised.recognised(forest, found, real.scale)))}
+            found = _motion_eval.drawn(models, real, samples=count, seed=config.seed)
+        means = _motion_eval.mean_of(_motion_eval.scores(found, real, train))
+        return means | {"accuracy": float(np.mean(_transition_classifier.recognised(forest, found, real.scale)))}
 
     return judge
 

@@ -27,10 +27,10 @@ from typing import Any
 import numpy as np
 from sklearn.ensemble import RandomForestClassifier
 
-from experiments import _cases, _recognised, _run
-from experiments import _interpolated as made_of
-from experiments import _interpolated_drawn as drawn
-from experiments._interpolated import PACES, PATHS, WAYS
+from experiments import _datasets, _run, _transition_classifier
+from experiments import _interpolation_eval as made_of
+from experiments import _interpolation_plots as drawn
+from experiments._interpolation_eval import PACES, PATHS, WAYS
 from facejax import augment
 from facejax.data import dataset, motions, transitions
 from facejax.data.synthetic import makehuman4d
@@ -71,7 +71,7 @@ def run(config: Config) -> dict[str, Any]:
     begun = time.perf_counter()
     data = _data(config)
     onsets = made_of.onsets_of(made_of.joined(data, HELD_OUT))
-    direct = made_of.joined(data, HELD_OUT, motions.directs)
+    direct = made_of.joined(data, HELD_OUT, motions.direct_transitions)
     walks = _walks(onsets, direct)
     metrics = {
         "onsets": _onsets(config, data, onsets),
@@ -95,7 +95,7 @@ def _data(config: Config) -> dataset.Dataset:
     if config.data is None:
         return makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
     data = dataset.open_dataset(config.data)
-    if not _cases.is_makehuman(data):
+    if not _datasets.is_makehuman(data):
         raise ValueError(f"{data.path}: only makehuman4d has transitions that were performed from peak to peak")
     return data
 
@@ -161,17 +161,17 @@ def _peaks(config: Config, data: dataset.Dataset, walks, direct: motions.Motions
 
 def _recognition(config: Config, data: dataset.Dataset, direct: motions.Motions) -> dict[str, float]:
     """Forests that learn OT23's set (halves, and selected transitions) made in each way, and see direct ones."""
-    pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in makehuman4d.PAIRS]
+    pairs = [(data.labels.index(a), data.labels.index(b)) for a, b in makehuman4d.TABLE5_PAIRS]
     halves = motions.halves(data, "train")
     onsets = made_of.onsets_of(halves)
     first, second = _selected(onsets, set(pairs), len(data.labels)).T
-    judged, which = _recognised.labelled(direct, pairs)
+    judged, which = _transition_classifier.labelled(direct, pairs)
     found = {}
     for path, pace in WAYS:
         curves = made_of.walk(onsets.curves[first], onsets.curves[second], path=path, pace=pace).curves
         labels = onsets.end[first], onsets.end[second]
         between = motions.Motions(curves, *labels, *(field[first] for field in onsets[3:]))
-        train, target = _recognised.labelled(motions.join(halves, between), pairs)
+        train, target = _transition_classifier.labelled(motions.join(halves, between), pairs)
         forest = RandomForestClassifier(config.trees, random_state=config.seed, n_jobs=-1)
         forest.fit(train.curves.reshape(len(target), -1), target)
         named = forest.predict(judged.curves.reshape(len(which), -1))
@@ -183,7 +183,7 @@ def _selected(onsets: motions.Motions, wanted: set[tuple[int, int]], labels: int
     """The pairs of onsets (P, 2) that `motion_examples.transitions` takes: nearest to the mean peaks."""
     peaks = onsets.curves[:, -1]
     prototypes = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
-    chosen = augment.select(peaks, onsets.end - 1, prototypes, per_pair=transitions.PER_PAIR, reuse=1).pairs
+    chosen = augment.select(peaks, onsets.end - 1, prototypes, per_pair=transitions.TRANSITIONS_PER_PAIR, reuse=1).pairs
     ends = zip(*onsets.end[chosen].T.tolist(), strict=True)
     return chosen[[pair in wanted for pair in ends]]
 

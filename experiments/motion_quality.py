@@ -22,7 +22,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _judged, _run
+from experiments import _datasets, _motion_eval, _run
 from facejax import metrics
 from facejax.data import motions, transitions
 from facejax.inference import pipeline
@@ -52,9 +52,9 @@ class Config:
 def run(config: Config) -> dict[str, Any]:
     """Generate every pair and compare it with real motions."""
     begun = time.perf_counter()
-    data = _cases.data_of(config.data, "default", level=config.level)
+    data = _datasets.data_of(config.data, "default", level=config.level)
     models = pipeline.load(config.model)
-    _judged.fits(models, data, config.model or "the released models")
+    _motion_eval.fits(models, data, config.model or "the released models")
     held_out = [split for split in ("validation", "test") if len(data.subjects(split))]
     real = motions.join(*(part for split in held_out for part in transitions.all_pairs(data, split, per_pair=20)))
     pairs = sorted(set(zip(real.start.tolist(), real.end.tolist(), strict=True)))

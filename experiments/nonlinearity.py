@@ -24,7 +24,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 from facejax.data.synthetic import rig
 from facejax.evaluation import baselines, noise_floor, vertex_error
 from facejax.models.decoders import gpmm, linear
@@ -40,7 +40,7 @@ COLOURS = {"ridge": "#c46b4e", "pca220": "#5b8db8", "rbf": "#999999", "gpmm": "#
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/nonlinearity")
     """Folder for checkpoints and results."""
     data: Path | None = None
@@ -60,29 +60,29 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """One row per level, registration noise, landmark noise, split, method and region."""
     mode = config.mode
-    _dense.check_methods(config.methods)
+    _mesh_eval.check_methods(config.methods)
     rows, floors, seconds = [], [], 0.0
     if config.data is not None:
         config = dataclasses.replace(config, levels=(config.data.name,), noises=(0.0,))
     for noise, level in itertools.product(config.noises, config.levels):
-        data = _cases.data_of(config.data, mode, level=level, noise=noise)
-        regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+        data = _datasets.data_of(config.data, mode, level=level, noise=noise)
+        regions, hierarchy = _datasets.regions_of(data), _datasets.hierarchy_of(data)
         for split in config.splits:
-            case = _cases.cases(data, [split])[0]
+            case = _datasets.cases(data, [split])[0]
             where = {"level": level, "noise_mm": noise, "split": split}
             plans = {} if mode != "default" else {"decoder": fit_s2d_dec.S2DDecPlan(steps=config.steps)}
-            options = _dense.options_of(case, mode, config.seed, hierarchy, **plans)
+            options = _mesh_eval.options_of(case, mode, config.seed, hierarchy, **plans)
             folder = config.folder() / f"level{level}-noise{noise:g}"
             for name in config.methods:
                 begun = time.perf_counter()
-                found = _dense.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)
+                found = _mesh_eval.judge(name, case, folder, options, regions, noises=LANDMARK_NOISE)
                 rows += _rows(where, name, found, regions)
                 seconds += found[0.0].seconds
                 shown = ", ".join(f"{r.distances.mean_std(regions['head'])[0]:.4f}" for r in found.values())
                 print(f"{where} {name}: {shown} mm, {time.perf_counter() - begun:.0f} s", flush=True)
-            told = _dense.remembered(
+            told = _mesh_eval.remembered(
                 folder / "told" / case.name,
-                _dense.key("gpmm", case, options, LANDMARK_NOISE),
+                _mesh_eval.key("gpmm", case, options, LANDMARK_NOISE),
                 LANDMARK_NOISE,
                 functools.partial(_told_and_floor, case, options, regions),
             )
@@ -107,9 +107,9 @@ def _rows(where: dict[str, Any], name: str, found: dict, regions: dict[str, np.n
     return rows
 
 
-def _told_and_floor(case, options: baselines.Options, regions) -> dict[float, _dense.Result]:
+def _told_and_floor(case, options: baselines.Options, regions) -> dict[float, _mesh_eval.Result]:
     """The morphable model under each landmark noise that it is told, with the two floors as what is known of it."""
-    fitted = _dense.base(case, options)
+    fitted = _mesh_eval.base(case, options)
     ridge = baselines.METHODS["ridge"].fit(case.train, Path(), options).params
     floors, told = _floors(case, fitted.params, ridge, regions), {}
     for noise in LANDMARK_NOISE:
@@ -118,7 +118,7 @@ def _told_and_floor(case, options: baselines.Options, regions) -> dict[float, _d
             lambda marks, rest, p=params: rest + np.asarray(linear.apply(gpmm.linear_map(p, rest), marks)),
             case.test, regions, noise=noise,
         )  # fmt: skip
-        told[noise] = _dense.Result(distances, 0.0, floors)
+        told[noise] = _mesh_eval.Result(distances, 0.0, floors)
     return told
 
 
@@ -166,7 +166,7 @@ def _table(rows, floors, config: Config) -> str:
                     known = [f"{line[what]['head']:.4f}" for what in ("landmarks", "landmarks and face")]
                     body.append((f"{level}, {noise:g}, {off:g}", *cells, *(known if off == 0 else ("", ""))))
         header = ["level, registration noise, landmark noise"]
-        header += [_dense.NAMES.get(name, "GPMM, told") for name in names]
+        header += [_mesh_eval.NAMES.get(name, "GPMM, told") for name in names]
         header += ["floor: landmarks", "floor: with the face"]
         title = "Held-out people" if split == "test" else "Held-out expressions"
         parts.append(f"{title}, mean vertex error in mm, head / face:\n\n{_run.markdown(header, body)}")
@@ -189,7 +189,7 @@ def _plot(path: Path, rows, floors, config: Config) -> Path:
                                region="face")
                         for level in config.levels
                     ]  # fmt: skip
-                    label = _dense.NAMES.get(name, "GPMM, told")
+                    label = _mesh_eval.NAMES.get(name, "GPMM, told")
                     shown = {"label": label, "color": COLOURS.get(name)}
                     axis.plot(places, np.maximum(values, 1e-5), marker="o", ms=3, **shown)
                 for what, style in (("landmarks", ":"), ("landmarks and face", "--")):
@@ -203,7 +203,7 @@ def _plot(path: Path, rows, floors, config: Config) -> Path:
         line[0].set_ylabel("mean vertex error of the face, mm")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, fontsize=9, loc="outside right center")
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

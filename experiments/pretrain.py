@@ -24,7 +24,7 @@ from typing import Any, Literal
 from experiments import _run
 from facejax.data import dataset, motions, transitions
 from facejax.data.mesh_subset import of_split
-from facejax.data.synthetic import assets, makehuman, makehuman4d, performance
+from facejax.data.synthetic import assets, expression_recipes, makehuman, makehuman4d
 from facejax.evaluation import vertex_error
 from facejax.inference import pipeline
 from facejax.io import cache
@@ -159,7 +159,7 @@ def _decoder_about(config: Config) -> dict[str, Any]:
 def _names(config: Config, data: dataset.Dataset) -> tuple[str, ...]:
     if config.motion is not None:
         return pipeline.load(config.motion).labels
-    return data.labels if config.labels == "all" else (performance.NEUTRAL, *performance.COMA)
+    return data.labels if config.labels == "all" else (expression_recipes.NEUTRAL, *expression_recipes.COMA)
 
 
 def _motion(config: Config, data: dataset.Dataset):
@@ -171,18 +171,18 @@ def _motion(config: Config, data: dataset.Dataset):
 
     def parts(per_pair):
         if config.onsets_only:
-            halves = motions.halves(data, "train", names=names)
+            halves = motions.halves(data, "train", label_names=names)
             return [halves.take(halves.start == 0)]
-        return transitions.all_pairs(data, "train", names=names, per_pair=per_pair)
+        return transitions.all_pairs(data, "train", label_names=names, per_pair=per_pair)
 
     folder = config.out / "motion"
     fit = fit_motion.fit_flow if config.generator == "flow" else fit_motion.fit_gan
     with _timed(folder) as seconds:
-        known = motions.join(*parts(transitions.CHARTED))
+        known = motions.join(*parts(transitions.CHART_PER_PAIR))
         chart = transitions.fit_chart(known, labels=len(names))
-        examples = transitions.encode_examples(chart, parts(transitions.SPREAD))
+        examples = transitions.encode_examples(chart, parts(transitions.SPREAD_PER_PAIR))
         generator = fit(examples, chart, folder, plan=_motion_plan(config), seed=config.seed)
-    beginnings = transitions.fit_starts(chart, motions.halves(data, "train", names=names))
+    beginnings = transitions.fit_start_poses(chart, motions.halves(data, "train", label_names=names))
     return (generator, beginnings), seconds()
 
 

@@ -24,7 +24,7 @@ import matplotlib
 import numpy as np
 
 from experiments import _run
-from experiments._warped import Face, Form, heat, others, regions_of, remeshed, sequence, still, weights
+from experiments._rbf_eval import Face, Form, heat, others, regions_of, remeshed, sequence, still, weights
 from facejax.data import dataset
 from facejax.data.mesh_subset import of_split
 from facejax.data.synthetic import makehuman4d

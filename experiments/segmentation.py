@@ -17,7 +17,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _run
+from experiments import _datasets, _run
 from facejax.data import dataset
 from facejax.data.importers import apex_detection
 
@@ -51,13 +51,13 @@ def run(config: Config) -> dict[str, Any]:
     if config.panels < 1:
         raise ValueError(f"panels: expected 1 or more, got {config.panels}")
     begun = time.perf_counter()
-    data = _cases.data_of(config.data, "quick" if config.quick else "default", level=config.level)
-    known = _cases.is_makehuman(data)
+    data = _datasets.data_of(config.data, "quick" if config.quick else "default", level=config.level)
+    known = _datasets.is_makehuman(data)
     takes = [take for take in data.sequences if ">" not in take.label]
     found = (
         [apex_detection.detect(*_curve(data, take)) for take in takes]
         if known
-        else [apex_detection.Cuts(*take[4:8]) for take in takes]
+        else [apex_detection.Phases(*take[4:8]) for take in takes]
     )
     metrics: dict[str, Any] = {"recordings": len(takes), "labels": _counts(takes)}
     if known:
@@ -78,7 +78,7 @@ def _curve(data: dataset.Dataset, take: dataset.Sequence) -> tuple[np.ndarray, n
 
 def _csv(data: dataset.Dataset, takes, found) -> str:
     """The cuts as `facejax data prepare --cuts` reads them."""
-    rows = ["subject,recording," + ",".join(apex_detection.Cuts._fields)]
+    rows = ["subject,recording," + ",".join(apex_detection.Phases._fields)]
     for take, cut in zip(takes, found, strict=True):
         name = take.name.rpartition("/")[2] or take.label
         rows.append(f"{data.index['subjects'][take.subject]['name']},{name}," + ",".join(map(str, cut)))
@@ -90,7 +90,7 @@ def _counts(takes: list[dataset.Sequence]) -> dict[str, int]:
     return dict(zip(labels.tolist(), counts.tolist(), strict=True))
 
 
-def _errors(takes: list[dataset.Sequence], found: list[apex_detection.Cuts]) -> list[dict[str, Any]]:
+def _errors(takes: list[dataset.Sequence], found: list[apex_detection.Phases]) -> list[dict[str, Any]]:
     """Frames between the cuts found and the performers' own."""
     off = np.array(found) - np.array([take[4:8] for take in takes])
     return [
@@ -101,7 +101,7 @@ def _errors(takes: list[dataset.Sequence], found: list[apex_detection.Cuts]) -> 
             "within_3": float(np.mean(np.abs(off[:, i]) <= 3)),
             "worst_frames": int(np.abs(off[:, i]).max()),
         }
-        for i, name in enumerate(apex_detection.Cuts._fields)
+        for i, name in enumerate(apex_detection.Phases._fields)
     ]
 
 
@@ -128,7 +128,7 @@ def _plot(path: Path, data: dataset.Dataset, takes, found, known: bool, panels: 
     for axis in axes.ravel():
         axis.set_axis_off()
     for axis, i in zip(axes.ravel(), chosen, strict=False):
-        take, moved = takes[i], apex_detection.energy(*_curve(data, takes[i]))
+        take, moved = takes[i], apex_detection.mean_displacement(*_curve(data, takes[i]))
         axis.set_axis_on()
         axis.plot(moved, color="0.3", lw=1)
         for (name, colour), at in zip(COLOURS.items(), found[i], strict=True):

@@ -21,8 +21,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _judged, _run
-from facejax.data.synthetic.makehuman4d import PAIRS
+from experiments import _motion_eval, _run
+from facejax.data.synthetic.makehuman4d import TABLE5_PAIRS
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -36,7 +36,7 @@ TRAINED = 240  # training motions of each pair among which the nearest is sought
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_judged.Options):
+class Config(_motion_eval.Options):
     out: Path = Path("runs/specificity")
     """Folder for the results."""
 
@@ -44,22 +44,22 @@ class Config(_judged.Options):
 def run(config: Config) -> dict[str, Any]:
     """Generate, and measure against real people."""
     begun = time.perf_counter()
-    judged = _judged.models_of(config)
-    data = _judged.data_of(config)
-    names = _judged.names_of(data)
-    real = _judged.held(config, "test", names)
-    train = _judged.seen(config, real.pairs, real.scale, TRAINED)
+    judged = _motion_eval.models_of(config)
+    data = _motion_eval.data_of(config)
+    names = _motion_eval.names_of(data)
+    real = _motion_eval.held(config, "test", names)
+    train = _motion_eval.seen(config, real.pairs, real.scale, TRAINED)
     each, frames, norms, seconds = [], [], [], []
     for models in judged:
-        found = _judged.drawn(models, real, samples=config.samples, seed=config.seed)
-        norms.append(_judged.norm_error(models, real.pairs, samples=config.samples, seed=config.seed))
-        seconds.append(_judged.seconds(models, real, samples=config.samples, seed=config.seed))
-        each.append(_judged.scores(found, real, train))
+        found = _motion_eval.drawn(models, real, samples=config.samples, seed=config.seed)
+        norms.append(_motion_eval.norm_error(models, real.pairs, samples=config.samples, seed=config.seed))
+        seconds.append(_motion_eval.seconds(models, real, samples=config.samples, seed=config.seed))
+        each.append(_motion_eval.scores(found, real, train))
         frames.append(_per_frame(found, real))
-    others = _judged.ceiling(real)
-    ceiling = _judged.scores(others, real, train)
+    others = _motion_eval.ceiling(real)
+    ceiling = _motion_eval.scores(others, real, train)
     rows = [{name: float(np.mean([rows[i][name] for rows in each])) for name in each[0][i]} for i in range(len(names))]
-    mean, mean_real = _judged.mean_of(rows), _judged.mean_of(ceiling)
+    mean, mean_real = _motion_eval.mean_of(rows), _motion_eval.mean_of(ceiling)
     metrics = {
         "specificity_mm": mean["specificity_mm"],
         "specificity_real_mm": mean_real["specificity_mm"],
@@ -75,7 +75,7 @@ def run(config: Config) -> dict[str, Any]:
         },
         "mean": mean,
         "mean_real": mean_real,
-        "mean_each": [_judged.mean_of(rows) for rows in each],
+        "mean_each": [_motion_eval.mean_of(rows) for rows in each],
         "per_transition": {f"{a}>{b}": row for (a, b), row in zip(names, rows, strict=True)},
         "per_transition_real": {f"{a}>{b}": row for (a, b), row in zip(names, ceiling, strict=True)},
         "people": real.people,
@@ -87,7 +87,7 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _per_frame(found: list[np.ndarray], real: _judged.Held) -> np.ndarray:
+def _per_frame(found: list[np.ndarray], real: _motion_eval.Held) -> np.ndarray:
     """Mean distance to the one held-out sample (39, T), in mm."""
     apart = (np.linalg.norm(mine - one, axis=-1) for mine, one in zip(found, real.reference, strict=True))
     return np.stack([distance.mean(axis=(0, 2)) for distance in apart])
@@ -130,7 +130,7 @@ def _table(metrics: dict[str, Any], models: int) -> str:
     )
     header = ("start", "end", "generated, mm", "real, mm", "OT23 on CoMA, mm", "diversity", "acceleration", "coverage")
     rows = []
-    papers = {f"{a}>{b}": str(figure) for (a, b), figure in zip(PAIRS, PAPER, strict=True)}
+    papers = {f"{a}>{b}": str(figure) for (a, b), figure in zip(TABLE5_PAIRS, PAPER, strict=True)}
     for name, row in metrics["per_transition"].items():
         real = metrics["per_transition_real"][name]["specificity_mm"]
         ratios = (f"{row[field]:.2f}" for field in ("diversity_ratio", "acceleration_ratio", "coverage"))

@@ -24,7 +24,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -44,7 +44,7 @@ PAPER = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/table1")
     """Folder for checkpoints and results."""
     data: Path | None = None
@@ -62,18 +62,18 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """One row per method, split and region."""
     mode = config.mode
-    _dense.check_methods(config.methods)
-    data = _cases.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+    _mesh_eval.check_methods(config.methods)
+    data = _datasets.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _datasets.regions_of(data), _datasets.hierarchy_of(data)
     results: dict[tuple[str, str], list] = {}
-    found = [case for case in _cases.cases(data, config.splits) if config.folds is None or case.fold < config.folds]
+    found = [case for case in _datasets.cases(data, config.splits) if config.folds is None or case.fold < config.folds]
     if not found:
         raise ValueError(f"--folds {config.folds}: expected 1 or more")
     for case in found:
         for name in config.methods:
             begun = time.perf_counter()
-            options = _dense.options_of(case, mode, config.seed, hierarchy)
-            result = _dense.judge(name, case, config.folder(), options, regions)[0.0]
+            options = _mesh_eval.options_of(case, mode, config.seed, hierarchy)
+            result = _mesh_eval.judge(name, case, config.folder(), options, regions)[0.0]
             results.setdefault((name, case.split), []).append(result)
             mean, face = (result.distances.mean_std(mask)[0] for mask in regions.values())
             print(f"{name} {case.name}: {mean:.4f} / {face:.4f} mm, {time.perf_counter() - begun:.0f} s", flush=True)
@@ -87,7 +87,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _rows(method: str, split: str, parts: list, regions: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    pooled = _dense.pooled(parts)
+    pooled = _mesh_eval.pooled(parts)
     rows = []
     for region, mask in regions.items():
         mean, std = pooled.mean_std(mask)
@@ -109,7 +109,7 @@ def _table(rows, config: Config) -> str:
     header += [f"OT23 on CoMA, {split}" for split in ("identity", "expression")] + ["training, min"]
     body = []
     for method in config.methods:
-        cells = [_dense.NAMES[method]]
+        cells = [_mesh_eval.NAMES[method]]
         for split in config.splits:
             cells.append(
                 "{:.4f} ± {:.4f} / {:.4f}".format(
@@ -133,12 +133,12 @@ def _plot(path: Path, rows, config: Config) -> Path:
             values = [value(rows, method, split, region) for method in config.methods]
             bars = axis.barh(place + 0.4 * i, values, 0.4, label=region, color=colour)
             axis.bar_label(bars, [f"{v:.3f}" for v in values], fontsize=7, padding=2)
-        axis.set_yticks(place + 0.2, [_dense.NAMES[m] for m in config.methods], fontsize=8)
+        axis.set_yticks(place + 0.2, [_mesh_eval.NAMES[m] for m in config.methods], fontsize=8)
         axis.invert_yaxis()
         axis.margins(x=0.18)
         axis.set(title=f"{split} split", xlabel="mean vertex error, mm")
     axes[0, 0].legend(frameon=False)
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

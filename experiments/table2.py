@@ -25,10 +25,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run, _transferred
+from experiments import _datasets, _mesh_eval, _motion_transfer, _run
 from facejax.data import dataset
 from facejax.data.mesh_subset import of_split
-from facejax.data.synthetic import makehuman, performance
+from facejax.data.synthetic import expression_recipes, makehuman
 from facejax.evaluation import baselines
 from facejax.inference import motion_sources
 from facejax.io import livelink
@@ -43,7 +43,7 @@ PAPER = {"pca220": 2.90, "dl3dmm": 2.73, "neural3dmm": 3.49, "s2d": 1.48}  # OT2
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/table2")
     """Folder for checkpoints and results."""
     recording: Path | None = None
@@ -69,24 +69,24 @@ def run(config: Config) -> dict[str, Any]:
     if config.people < 1 or config.passages < 1:
         raise ValueError(f"expected --people and --passages of 1 or more, got {config.people} and {config.passages}")
     mode = config.mode
-    _dense.check_methods(config.methods)
-    data = _cases.data_of(config.data, mode, level=LEVEL)
-    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
+    _mesh_eval.check_methods(config.methods)
+    data = _datasets.data_of(config.data, mode, level=LEVEL)
+    regions, hierarchy = _datasets.regions_of(data), _datasets.hierarchy_of(data)
     train = of_split(data, *(split for split in ("train", "validation") if len(data.subjects(split))))
-    train = _cases.at_most(train.of_labels(performance.COMA) if _cases.is_makehuman(data) else train)
-    case = _cases.Case("speech", 0, train, train, "labels")
-    options = _dense.options_of(case, mode, config.seed, hierarchy)
+    train = _datasets.at_most(train.of_labels(expression_recipes.COMA) if _datasets.is_makehuman(data) else train)
+    case = _datasets.Case("speech", 0, train, train, "labels")
+    options = _mesh_eval.options_of(case, mode, config.seed, hierarchy)
     pairs = _of_recording(config, data) if config.speech is None else _of_dataset(config, data)
     rows, begun = [], time.perf_counter()
     for name in config.methods:
-        fitted = _dense.fitted(name, case, config.folder(), options)
+        fitted = _mesh_eval.fitted(name, case, config.folder(), options)
         errors = {"transferred": {}, "own": {}}
         for source, target in pairs:
-            marks = {"transferred": _transferred.onto(source, target, data.landmark_index), "own": target.landmarks}
+            marks = {"transferred": _motion_transfer.onto(source, target, data.landmark_index), "own": target.landmarks}
             for what, landmarks in marks.items():
                 made = baselines.METHODS[name].apply(fitted, landmarks.astype(np.float32), target.rest)
                 for region, mask in regions.items():
-                    errors[what].setdefault(region, []).append(_transferred.errors(made, target, mask, WINDOW))
+                    errors[what].setdefault(region, []).append(_motion_transfer.errors(made, target, mask, WINDOW))
         for region in regions:
             row = {"method": name, "region": region}
             for what, found in errors.items():
@@ -102,9 +102,9 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
-def _of_recording(config: Config, data: dataset.Dataset) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_recording(config: Config, data: dataset.Dataset) -> list[tuple[_motion_transfer.Take, _motion_transfer.Take]]:
     """(source, target) of every passage and person, test subjects of makehuman4d, as their own rigs move them."""
-    if not _cases.is_makehuman(data):
+    if not _datasets.is_makehuman(data):
         raise ValueError(f"--recording moves people of makehuman4d, and {config.data} has others: use --speech")
     source, *others = data.subjects("test").tolist()
     if not others:
@@ -117,27 +117,29 @@ def _of_recording(config: Config, data: dataset.Dataset) -> list[tuple[_transfer
     begins = np.linspace(0.1 * length, 0.9 * length - config.seconds, config.passages)
     takes = [motion_sources.read_recording(config.recording, begin=float(b), seconds=config.seconds) for b in begins]
     faces = {i: makehuman.subject(i, seed=data.index["spec"]["seed"]) for i in (source, *others[: config.people])}
-    moved = {i: [_transferred.posed(take, face, data.landmark_index) for take in takes] for i, face in faces.items()}
+    moved = {
+        i: [_motion_transfer.posed(take, face, data.landmark_index) for take in takes] for i, face in faces.items()
+    }
     first = moved.pop(source)
     return [pair for of_one in moved.values() for pair in zip(first, of_one, strict=True)]
 
 
-def _of_dataset(config: Config, data: dataset.Dataset) -> list[tuple[_transferred.Take, _transferred.Take]]:
+def _of_dataset(config: Config, data: dataset.Dataset) -> list[tuple[_motion_transfer.Take, _motion_transfer.Take]]:
     """(source, target) of every label and person of a dataset, test subjects where it has enough of them."""
     talk = dataset.open_meshes(config.speech)
-    _cases.check_alike(talk, data)
+    _datasets.check_alike(talk, data)
     people = talk.subjects("test") if len(talk.subjects("test")) > 1 else np.arange(len(talk.neutral))
     named = talk.labels[1:]
-    speakers = [who for who in people.tolist() if any(_transferred.stored(talk, who, label) for label in named)]
+    speakers = [who for who in people.tolist() if any(_motion_transfer.stored(talk, who, label) for label in named)]
     if len(speakers) < 2:
         raise ValueError(f"{talk.path}: expected two or more people with recordings that have meshes")
     source, *others = speakers[: config.people + 1]
-    labels = [label for label in named if _transferred.stored(talk, source, label)][: config.passages]
+    labels = [label for label in named if _motion_transfer.stored(talk, source, label)][: config.passages]
     pairs = [
-        (_transferred.stored(talk, source, label), target)
+        (_motion_transfer.stored(talk, source, label), target)
         for label in labels
         for other in others
-        if (target := _transferred.stored(talk, other, label)) is not None
+        if (target := _motion_transfer.stored(talk, other, label)) is not None
     ]
     if not pairs:
         raise ValueError(f"{talk.path}: expected two or more people with recordings of one label that have meshes")
@@ -153,7 +155,7 @@ def _table(rows, methods_) -> str:
     body = []
     for name in methods_:
         cells = [" / ".join(f"{_value(rows, name, region, kind):.3f}" for region in ("head", "face")) for kind in kinds]
-        body.append((_dense.NAMES[name], *cells, f"{PAPER[name]:.2f}" if name in PAPER else ""))
+        body.append((_mesh_eval.NAMES[name], *cells, f"{PAPER[name]:.2f}" if name in PAPER else ""))
     header = ("mm, head / face", "transferred, frame by frame", f"least within {WINDOW} frames",
               "from the person's own landmarks", "OT23 on VOCASET, least within 20")  # fmt: skip
     return _run.markdown(header, body)
@@ -164,10 +166,10 @@ def _plot(path: Path, rows, methods_) -> Path:
     for i, (kind, label) in enumerate((("own_mm", "own landmarks"), ("transferred_mm", "transferred"))):
         values = [_value(rows, name, "face", kind) for name in methods_]
         axis.bar(np.arange(len(methods_)) + 0.4 * i - 0.2, values, 0.4, label=label)
-    axis.set_xticks(range(len(methods_)), [_dense.NAMES[name] for name in methods_], rotation=20, ha="right")
+    axis.set_xticks(range(len(methods_)), [_mesh_eval.NAMES[name] for name in methods_], rotation=20, ha="right")
     axis.set_ylabel("mean vertex error of the face, mm")
     figure.legend(frameon=False, loc="outside right center")
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

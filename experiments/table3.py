@@ -21,7 +21,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 from facejax.data import dataset
 from facejax.data.mesh_subset import MeshSubset, of_split
 from facejax.evaluation import vertex_error
@@ -43,7 +43,7 @@ PAPER = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/table3")
     """Folder for checkpoints and results."""
     first: Path | None = None
@@ -57,25 +57,25 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """One row per direction, method and region."""
     mode = config.mode
-    _dense.check_methods(config.methods)
-    a = _cases.data_of(config.first, mode, level=LEVEL, seed=SEEDS[0])
-    b = _cases.data_of(config.second, mode, level=LEVEL, seed=SEEDS[1], noise=NOISE)
-    _cases.check_alike(a, b)
-    regions, hierarchy = _cases.regions_of(a), _cases.hierarchy_of(a)
+    _mesh_eval.check_methods(config.methods)
+    a = _datasets.data_of(config.first, mode, level=LEVEL, seed=SEEDS[0])
+    b = _datasets.data_of(config.second, mode, level=LEVEL, seed=SEEDS[1], noise=NOISE)
+    _datasets.check_alike(a, b)
+    regions, hierarchy = _datasets.regions_of(a), _datasets.hierarchy_of(a)
     directions = [("A to B", a, _everybody(b)), ("B to A", b, of_split(a, "test"))]
     if config.second is None:
-        clean = _cases.data_of(None, mode, level=LEVEL, seed=SEEDS[1])
+        clean = _datasets.data_of(None, mode, level=LEVEL, seed=SEEDS[1])
         directions.insert(1, ("A to B, clean", a, _everybody(clean)))
     rows, seconds = [], 0.0
     for title, source, test in directions:
-        case = _cases.Case(
-            title.replace(" ", "_").replace(",", ""), 0, _training(source), _cases.at_most(test), "subjects"
+        case = _datasets.Case(
+            title.replace(" ", "_").replace(",", ""), 0, _training(source), _datasets.at_most(test), "subjects"
         )
-        options = _dense.options_of(case, mode, config.seed, hierarchy)
+        options = _mesh_eval.options_of(case, mode, config.seed, hierarchy)
         for name in config.methods:
             begun = time.perf_counter()
             # What was trained for one direction serves every judgement of it.
-            result = _dense.judge(name, case, config.folder(), options, regions, trained=title[0])[0.0]
+            result = _mesh_eval.judge(name, case, config.folder(), options, regions, trained=title[0])[0.0]
             seconds += result.seconds
             for region, mask in regions.items():
                 mean, std = result.distances.mean_std(mask)
@@ -83,7 +83,7 @@ def run(config: Config) -> dict[str, Any]:
                 rows.append(row | {"chosen": result.about})
             print(f"{title} {name}: {rows[-2]['mean_mm']:.4f} mm, {time.perf_counter() - begun:.0f} s", flush=True)
     if config.second is None:
-        alone = _noise_alone(_cases.at_most(_everybody(b)), _cases.at_most(_everybody(clean)), regions)
+        alone = _noise_alone(_datasets.at_most(_everybody(b)), _datasets.at_most(_everybody(clean)), regions)
         rows += [{"direction": "A to B", "method": ALONE, "region": region} | row for region, row in alone.items()]
     made = _run.record(config, seconds=seconds, dataset={"A": a.index["spec"], "B": b.index["spec"]})
     titles = [title for title, _, _ in directions]
@@ -105,7 +105,7 @@ def _everybody(data: dataset.Dataset) -> MeshSubset:
 
 def _training(data: dataset.Dataset) -> MeshSubset:
     known = [split for split in ("train", "validation") if len(data.subjects(split))]
-    return _cases.at_most(of_split(data, *known))
+    return _datasets.at_most(of_split(data, *known))
 
 
 def _value(rows, direction: str, method: str, region: str, what: str = "mean_mm") -> float:
@@ -126,7 +126,7 @@ def _table(rows, titles, methods) -> str:
             for title in titles
         ]
         paper = ["{:.2f} ± {:.2f}".format(*figure) for figure in PAPER[method]] if method in PAPER else ["", ""]
-        body.append((_dense.NAMES.get(method, method), *cells, *paper))
+        body.append((_mesh_eval.NAMES.get(method, method), *cells, *paper))
     header = ("mm, head / face", *titles, "OT23: Florence 4D to CoMA", "OT23: CoMA to Florence 4D")
     return _run.markdown(header, body)
 
@@ -137,7 +137,7 @@ def _plot(path: Path, rows, titles, methods) -> Path:
     for i, method in enumerate(methods):
         values = [_value(rows, title, method, "face") for title in titles]
         axis.bar(
-            np.arange(len(titles)) + width * (i - len(methods) / 2 + 0.5), values, width, label=_dense.NAMES[method]
+            np.arange(len(titles)) + width * (i - len(methods) / 2 + 0.5), values, width, label=_mesh_eval.NAMES[method]
         )
     axis.set_xticks(range(len(titles)), titles)
     axis.set_ylabel("mean vertex error of the face, mm")
@@ -145,7 +145,7 @@ def _plot(path: Path, rows, titles, methods) -> Path:
     if not np.isnan(alone):
         axis.plot([-0.45, 0.45], [alone, alone], "k--", linewidth=1, label=ALONE)
     figure.legend(frameon=False, fontsize=8, loc="outside right center")
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

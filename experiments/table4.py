@@ -22,7 +22,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _dense, _run
+from experiments import _datasets, _mesh_eval, _run
 from facejax.training.recipes import fit_s2d_dec
 
 matplotlib.use("Agg")
@@ -42,7 +42,7 @@ PAPER = {"S1": (1.27, 1.88), "S2": (0.92, 1.33), "S3, inverse": (0.50, 0.56)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Config(_dense.Options):
+class Config(_mesh_eval.Options):
     out: Path = Path("runs/table4")
     """Folder for checkpoints and results."""
     data: Path | None = None
@@ -56,17 +56,17 @@ class Config(_dense.Options):
 def run(config: Config) -> dict[str, Any]:
     """One row per variant and region."""
     mode = config.mode
-    data = _cases.data_of(config.data, mode, level=config.level)
-    regions, hierarchy = _cases.regions_of(data), _cases.hierarchy_of(data)
-    case = _cases.cases(data, ["identity"])[0]
+    data = _datasets.data_of(config.data, mode, level=config.level)
+    regions, hierarchy = _datasets.regions_of(data), _datasets.hierarchy_of(data)
+    case = _datasets.cases(data, ["identity"])[0]
     rows, seconds = [], 0.0
     for name, changes in VARIANTS.items():
         begun = time.perf_counter()
-        options = _dense.options_of(case, mode, config.seed, hierarchy)
+        options = _mesh_eval.options_of(case, mode, config.seed, hierarchy)
         plan = options.decoder if mode != "default" else fit_s2d_dec.S2DDecPlan(steps=config.steps)
         options = options._replace(decoder=plan._replace(**changes))
         folder = config.folder() / name.replace(", ", "-").lower()
-        result = _dense.judge("s2d", case, folder, options, regions)[0.0]
+        result = _mesh_eval.judge("s2d", case, folder, options, regions)[0.0]
         seconds += result.seconds
         for region, mask in regions.items():
             mean, std = result.distances.mean_std(mask)
@@ -102,7 +102,7 @@ def _plot(path: Path, rows) -> Path:
     axis.invert_yaxis()
     axis.set_xlabel("mean vertex error, mm")
     figure.legend(frameon=False, loc="outside right center")
-    return _dense.drawn(figure, path)
+    return _mesh_eval.drawn(figure, path)
 
 
 if __name__ == "__main__":

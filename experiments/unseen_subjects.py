@@ -19,7 +19,7 @@ import jax
 import matplotlib
 import numpy as np
 
-from experiments import _cases, _run
+from experiments import _datasets, _run
 from facejax.data import dataset
 from facejax.data.mesh_subset import MeshSubset, of_split
 from facejax.data.synthetic import makehuman4d, rig
@@ -63,7 +63,7 @@ def run(config: Config) -> dict[str, Any]:
     for level in levels:
         data = _data(config, level)
         train, test = of_split(data, "train"), of_split(data, "test")
-        regions = _cases.regions_of(data)
+        regions = _datasets.regions_of(data)
         for name, model, options in (("ridge", linear.ridge, {}), ("pca220", linear.pca, {"components": 220})):
             params, alpha = fit_linear.fit_linear(model, train, **options)
             found = vertex_error.vertex_errors(lambda m, p=params: linear.apply(p, m), test, regions)
@@ -88,7 +88,7 @@ def _named(level: int | str) -> str:
 
 
 def _decoder(config: Config, level: int | str, train: MeshSubset):
-    hierarchy = jax.device_put(_cases.hierarchy_of(train.data))
+    hierarchy = jax.device_put(_datasets.hierarchy_of(train.data))
     folder, plan = config.out / _named(level).replace(" ", ""), fit_s2d_dec.S2DDecPlan(steps=config.steps)
     params = fit_s2d_dec.fit(train, hierarchy, folder, plan=plan, seed=config.seed)
     seconds = sum(entry["seconds"] for entry in metric_logger.read(folder))

@@ -29,7 +29,7 @@ import numpy as np
 
 from experiments import _run, _study
 from facejax.cli import outputs
-from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
+from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d, performance, rig
 from facejax.geometry import align
 from facejax.inference import pipeline
 from facejax.viz import eyes_teeth, render, video
@@ -163,7 +163,7 @@ def plan(config: Config, models: dict[str, pipeline.Models]) -> list[Item]:
     for item in others:
         pipeline.label_indices(models["predecessor"], item.labels)
     for item in real:
-        if item.labels[1] not in performance.EXPRESSIONS:
+        if item.labels[1] not in expression_recipes.EXPRESSIONS:
             raise ValueError(f"real: the dataset has no {item.labels[1]!r}; go without with --real 0")
     return composed + ours + others + real
 

@@ -6,7 +6,19 @@ import json
 import numpy as np
 import pytest
 
-from experiments import _cases, _dense, _run, figure5, figure6, figure9, nonlinearity, table1, table2, table3, table4
+from experiments import (
+    _datasets,
+    _mesh_eval,
+    _run,
+    figure5,
+    figure6,
+    figure9,
+    nonlinearity,
+    table1,
+    table2,
+    table3,
+    table4,
+)
 from facejax.data import dataset
 from facejax.data.mesh_subset import of_split
 from facejax.data.synthetic import makehuman4d
@@ -19,13 +31,13 @@ from tests.test_experiments import check, own_cache  # noqa: F401 (a fixture)
 @pytest.fixture
 def tiny(own_cache, monkeypatch):  # noqa: F811
     """Six people, two steps, few candidates."""
-    monkeypatch.setattr(_cases, "QUICK", {"subjects": 6, "meshes": 260})
-    monkeypatch.setattr(_dense, "QUICK_STEPS", 2)
-    monkeypatch.setattr(_dense, "QUICK_COMPONENTS", 8)
-    monkeypatch.setattr(_cases, "FOLDS", 2)
+    monkeypatch.setattr(_datasets, "QUICK", {"subjects": 6, "meshes": 260})
+    monkeypatch.setattr(_mesh_eval, "QUICK_STEPS", 2)
+    monkeypatch.setattr(_mesh_eval, "QUICK_COMPONENTS", 8)
+    monkeypatch.setattr(_datasets, "FOLDS", 2)
     monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
-    monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.0, 0.03))
-    monkeypatch.setattr(fit_gpmm, "NOISE", (1e-4,))
+    monkeypatch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.0, 0.03))
+    monkeypatch.setattr(fit_gpmm, "NOISE_GRID", (1e-4,))
     monkeypatch.setattr(fit_gpmm, "JUDGED", 1)
 
 
@@ -64,28 +76,28 @@ def test_table1_on_a_store_of_ones_own(tiny, tiny_store, tmp_path):
 
 
 def test_a_result_is_made_anew_when_what_it_depends_on_changes(tiny, tiny_store, tmp_path, monkeypatch):
-    case = _cases.cases(tiny_store, ["identity"])[0]
-    regions, options = _cases.regions_of(tiny_store), baselines.Options()
-    first = _dense.judge("still", case, tmp_path, options, regions)[0.0]
-    again = _dense.judge("still", case, tmp_path, options, regions)[0.0]
+    case = _datasets.cases(tiny_store, ["identity"])[0]
+    regions, options = _datasets.regions_of(tiny_store), baselines.Options()
+    first = _mesh_eval.judge("still", case, tmp_path, options, regions)[0.0]
+    again = _mesh_eval.judge("still", case, tmp_path, options, regions)[0.0]
     np.testing.assert_array_equal(first.distances.total, again.distances.total)
     fewer = case._replace(test=case.test.thin(2))
-    assert _dense.judge("still", fewer, tmp_path, options, regions)[0.0].distances.count < first.distances.count
+    assert _mesh_eval.judge("still", fewer, tmp_path, options, regions)[0.0].distances.count < first.distances.count
 
 
 def test_cases_share_nobody_or_no_expression(tiny_store):
     people = set(tiny_store.subjects("train")) | set(tiny_store.subjects("validation"))
-    identity = _cases.cases(tiny_store, ["identity"])
+    identity = _datasets.cases(tiny_store, ["identity"])
     assert len(identity) == 4 and {i for c in identity for i in c.test.subjects} == people
     assert all(not set(c.train.subjects) & set(c.test.subjects) and c.by == "subjects" for c in identity)
-    expression = _cases.cases(tiny_store, ["expression"])
+    expression = _datasets.cases(tiny_store, ["expression"])
     held = [set(c.test.labels) for c in expression]
     assert all(not set(c.train.labels) & h and c.by == "labels" for c, h in zip(expression, held, strict=True))
     assert "anger" not in set.union(*held)
-    (test,) = _cases.cases(tiny_store, ["test"])
+    (test,) = _datasets.cases(tiny_store, ["test"])
     assert set(test.test.subjects) == set(tiny_store.subjects("test")) and set(test.train.subjects) == people
     with pytest.raises(ValueError, match="unknown split 'age'"):
-        _cases.cases(tiny_store, ["age"])
+        _datasets.cases(tiny_store, ["age"])
 
 
 @pytest.mark.parametrize(
@@ -115,17 +127,17 @@ def test_published_splits(tiny_store, name, identity, expression):
         drawn=np.arange(len(recordings)),
         vertices=np.broadcast_to(tiny_store.vertices[:1], (len(recordings), *tiny_store.vertices.shape[1:])),
     )
-    by_person, *more = _cases.cases(data, ["identity"])
+    by_person, *more = _datasets.cases(data, ["identity"])
     assert len(more) == (3 if name == "coma" else 0)
     assert len(by_person.test.subjects) == identity
-    by_label = _cases.cases(data, ["expression"])[0]
+    by_label = _datasets.cases(data, ["expression"])[0]
     assert set(by_label.test.labels) == expression and by_label.test.count + by_label.train.count == len(recordings)
     held = by_person.test.subjects
     if name == "florence4d":
         assert set(held) == {*range(15, 45), *range(50, 60)}
         del people[2]["sex"]
         with pytest.raises(ValueError, match="nothing says whether p2 is female or male"):
-            _cases.cases(data, ["identity"])
+            _datasets.cases(data, ["identity"])
     else:
         assert set(held) == set(range(identity))
 
@@ -151,7 +163,7 @@ def test_table4_trains_each_variant(tiny, tmp_path, monkeypatch):
 
 def test_nonlinearity_with_noise_and_floor(tiny, tmp_path, monkeypatch):
     # Two people to judge: what landmarks leave open is seen between people.
-    monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
+    monkeypatch.setattr(_datasets, "QUICK", {"subjects": 12, "meshes": 300})
     config = nonlinearity.Config(
         out=tmp_path / "o", quick=True, levels=(0,), noises=(0.0,), methods=("ridge",), splits=("test",)
     )
@@ -169,7 +181,7 @@ def test_table2_carries_a_recording_to_others(tiny, tmp_path, monkeypatch):
     )
     with pytest.raises(ValueError, match="expected two or more test subjects, got 1"):
         table2.run(config)
-    monkeypatch.setattr(_cases, "QUICK", {"subjects": 12, "meshes": 300})
+    monkeypatch.setattr(_datasets, "QUICK", {"subjects": 12, "meshes": 300})
     monkeypatch.setattr(table2, "LEVEL", 0)
     for wrong, message in (
         ({"people": 0}, "--people and --passages of 1 or more"),
@@ -240,11 +252,13 @@ def test_the_first_folds_alone(tiny_store, tmp_path):
 
 
 def test_two_datasets_in_other_topologies_are_told(tiny_store):
-    _cases.check_alike(tiny_store, tiny_store)
+    _datasets.check_alike(tiny_store, tiny_store)
     with pytest.raises(ValueError, match="have other landmarks"):
-        _cases.check_alike(tiny_store, tiny_store._replace(landmark_index=np.asarray(tiny_store.landmark_index)[::-1]))
+        _datasets.check_alike(
+            tiny_store, tiny_store._replace(landmark_index=np.asarray(tiny_store.landmark_index)[::-1])
+        )
     with pytest.raises(ValueError, match="have other triangles"):
-        _cases.check_alike(tiny_store, tiny_store._replace(faces=np.asarray(tiny_store.faces)[:-1]))
+        _datasets.check_alike(tiny_store, tiny_store._replace(faces=np.asarray(tiny_store.faces)[:-1]))
 
 
 def test_modes_exclude_each_other():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments import (
-    _cases,
-    _interpolated,
+    _datasets,
+    _interpolation_eval,
     classification,
     composed,
     dataset_card,
@@ -37,8 +37,8 @@ def own_cache(tmp_path, monkeypatch):
 
     assets.load()
     # The choice of the linear maps' one weight is what takes the time; two candidates show that it works.
-    monkeypatch.setattr(vertex_error, "ALPHAS", (1e-6, 1e-2))
-    monkeypatch.setattr(vertex_error, "FOLDS", 2)
+    monkeypatch.setattr(fit_linear, "ALPHAS", (1e-6, 1e-2))
+    monkeypatch.setattr(fit_linear, "FOLDS", 2)
     monkeypatch.setenv("FACEJAX_CACHE", str(tmp_path / "cache"))
 
 
@@ -51,7 +51,7 @@ def check(out, *fields):
 
 
 def test_dataset_card(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(_cases, "FOLDS", 2)
+    monkeypatch.setattr(_datasets, "FOLDS", 2)
     dataset_card.run(dataset_card.Config(out=tmp_path / "o", levels=(0,), **TINY))
     metrics = check(tmp_path / "o", "levels", "speed_mm_per_s")
     errors = metrics["levels"]["0"]["error_mm"]["subjects"]
@@ -69,11 +69,11 @@ def test_unseen_subjects(own_cache, tmp_path):
 
 
 def test_pretrain(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(transitions, "SPREAD", 2)
-    monkeypatch.setattr(transitions, "CHARTED", 2)
+    monkeypatch.setattr(transitions, "SPREAD_PER_PAIR", 2)
+    monkeypatch.setattr(transitions, "CHART_PER_PAIR", 2)
     monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
-    monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.12,))
-    monkeypatch.setattr(fit_gpmm, "NOISE", (1e-2,))
+    monkeypatch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.12,))
+    monkeypatch.setattr(fit_gpmm, "NOISE_GRID", (1e-2,))
     config = pretrain.Config(out=tmp_path / "o", level=1, motion_steps=2, decoder_steps=2, **TINY)
     pretrain.run(config)
     metrics = check(tmp_path / "o", "error_mm", "seconds")
@@ -120,8 +120,8 @@ PEOPLE = {"level": 1, "people": 6, **TINY}
 
 
 def test_generators(own_cache, tmp_path, monkeypatch):
-    monkeypatch.setattr(transitions, "SPREAD", 2)
-    monkeypatch.setattr(transitions, "CHARTED", 2)
+    monkeypatch.setattr(transitions, "SPREAD_PER_PAIR", 2)
+    monkeypatch.setattr(transitions, "CHART_PER_PAIR", 2)
     config = generators.Config(out=tmp_path / "o", variants=("gaussian", "flow"), seeds=(0, 1), flow_steps=2, **PEOPLE)
     generators.run(config)
     metrics = check(tmp_path / "o", "chosen", "validation", "real", "per_seed")
@@ -184,15 +184,15 @@ def test_interpolation(own_cache, tmp_path):
 
 def test_walks_are_those_of_the_library_and_takes_those_of_the_dataset(own_cache):
     data = makehuman4d.prepare(makehuman4d.Spec(0, **TINY))
-    halves = _interpolated.joined(data, ("train",))
-    onsets = _interpolated.onsets_of(halves)
+    halves = _interpolation_eval.joined(data, ("train",))
+    onsets = _interpolation_eval.onsets_of(halves)
     for pace in ("even", "performed"):
-        (theirs,) = motions.interpolated(onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace)
+        (theirs,) = motions.interpolated_transitions(onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace)
         pairs = augment.spread(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
-        mine = _interpolated.walk(*(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace)
+        mine = _interpolation_eval.walk(*(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace)
         np.testing.assert_allclose(mine.curves, theirs.curves, atol=1e-6)
-    direct = motions.directs(data, "test").take(np.arange(3))
-    np.testing.assert_allclose(_interpolated.again(data, direct, take=0).curves, direct.curves, atol=1e-6)
+    direct = motions.direct_transitions(data, "test").take(np.arange(3))
+    np.testing.assert_allclose(_interpolation_eval.again(data, direct, take=0).curves, direct.curves, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import (
-    _transferred,
+    _motion_transfer,
     classification,
     composed,
     dataset_card,
@@ -75,7 +75,7 @@ def model(own, tmp_path_factory):
     chart = transitions.fit_chart(known, labels=len(LABELS), rank=transitions.default_rank(known))
     examples = transitions.encode_examples(chart, known)
     motion = fit_motion.fit_flow(examples, chart, path.with_suffix(""), plan=fit_motion.FlowPlan(steps=2, batch=8))
-    starts = transitions.fit_starts(chart, motions.halves(data, "train"))
+    starts = transitions.fit_start_poses(chart, motions.halves(data, "train"))
     pipeline.save(path, pipeline.load()._replace(labels=LABELS, motion=motion, starts=starts))
     return path
 
@@ -93,8 +93,8 @@ def test_generated_motion(own_cache, own, model, experiment, tmp_path):  # noqa:
 
 
 def test_generators_are_chosen(own_cache, own, model, tmp_path, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(transitions, "SPREAD", 3)
-    monkeypatch.setattr(transitions, "CHARTED", 8)
+    monkeypatch.setattr(transitions, "SPREAD_PER_PAIR", 3)
+    monkeypatch.setattr(transitions, "CHART_PER_PAIR", 8)
     options = {"variants": ("gaussian", "flow"), "seeds": (0,), "flow_steps": 2}
     with pytest.raises(ValueError, match="the released models: expected the labels"):
         generators.run(generators.Config(out=tmp_path / "o", data=own, **options))
@@ -172,29 +172,29 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
 
 def test_a_take_is_carried_onto_itself_and_stretched(own):
     data = dataset.open_dataset(own)
-    take = _transferred.stored(data, 14, "gape")
-    np.testing.assert_allclose(_transferred.onto(take, take, data.landmark_index), take.landmarks, atol=2e-3)
+    take = _motion_transfer.stored(data, 14, "gape")
+    np.testing.assert_allclose(_motion_transfer.onto(take, take, data.landmark_index), take.landmarks, atol=2e-3)
     np.testing.assert_array_equal(
         take.vertices[:, data.landmark_index], (take.rest[data.landmark_index] + take.landmarks)[take.at]
     )
     longer = take._replace(landmarks=np.repeat(take.landmarks, 2, axis=0))
-    carried = _transferred.onto(take, longer, data.landmark_index)
+    carried = _motion_transfer.onto(take, longer, data.landmark_index)
     np.testing.assert_allclose(carried[[0, -1]], take.landmarks[[0, -1]], atol=2e-3)
     energy = [np.linalg.norm(curve, axis=-1).mean(axis=-1) for curve in (carried, take.landmarks)]
     assert energy[0].argmax() // 2 == pytest.approx(energy[1].argmax(), abs=1)
-    assert _transferred.stored(data, 14, "sneer") is None
+    assert _motion_transfer.stored(data, 14, "sneer") is None
 
 
 def test_errors_look_about_in_a_window():
     rest = np.zeros((2, 3))
     true = np.arange(8.0)[:, None, None] + np.zeros((8, 2, 3))
-    take = _transferred.Take("p", rest, true, np.array([0, 5, 7]), true[[0, 5, 7]])
+    take = _motion_transfer.Take("p", rest, true, np.array([0, 5, 7]), true[[0, 5, 7]])
     late = true - 2  # two frames behind
-    aligned, best = _transferred.errors(late, take, np.ones(2, bool), 4)
+    aligned, best = _motion_transfer.errors(late, take, np.ones(2, bool), 4)
     np.testing.assert_allclose(aligned, 2 * np.sqrt(3))
     # The last frame has nothing after it to look at.
     np.testing.assert_allclose(best, [0, 0, 2 * np.sqrt(3)], atol=1e-9)
-    np.testing.assert_array_equal(_transferred.errors(late, take, np.ones(2, bool), 0)[1], aligned)
+    np.testing.assert_array_equal(_motion_transfer.errors(late, take, np.ones(2, bool), 0)[1], aligned)
 
 
 def test_what_only_makehuman4d_has(own_cache, own, tmp_path):  # noqa: F811

@@ -14,7 +14,7 @@ def test_cuts_are_held_against_the_performers(tiny_store, tmp_path, monkeypatch)
     monkeypatch.setattr(makehuman4d, "prepare", lambda spec: tiny_store)
     errors = segmentation.run(segmentation.Config(out=tmp_path, quick=True, panels=4))["errors"]
     check(tmp_path, "recordings", "errors")
-    assert [row["cut"] for row in errors] == list(apex_detection.Cuts._fields)
+    assert [row["cut"] for row in errors] == list(apex_detection.Phases._fields)
     for row in errors:
         assert 0 < row["mean_frames"] < 8 and row["mean_frames"] <= row["worst_frames"]
     # Thresholds lie inside of the motion.
@@ -39,6 +39,6 @@ def test_the_table_is_read_back(tiny_store, tmp_path):
     first = table[1].split(",")
     first[2:] = ["0", "9", "10", "20"]
     (tmp_path / "cuts.csv").write_text("\n".join([table[0], ",".join(first), table[2]]))
-    again = registry.prepare("folder", tmp_path / "root", tmp_path / "again", cuts=tmp_path / "cuts.csv", **options)
+    again = registry.prepare("folder", tmp_path / "root", tmp_path / "again", phases=tmp_path / "cuts.csv", **options)
     assert dataset.Sequence(*again.sequences[0])[4:8] == (0, 9, 10, 20)
     assert again.sequences[1][4:8] == data.sequences[1][4:8]

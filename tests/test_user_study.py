@@ -284,7 +284,7 @@ def test_without_scores_or_items_no_table_is_made(tmp_path):
 
 
 def test_the_command_refuses_in_one_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(runtime, "start", lambda: None)
+    monkeypatch.setattr(runtime, "configure", lambda: None)
     (tmp_path / "items.json").write_text(json.dumps(STUDY))
     folder = write(tmp_path / "scores", p=answers(P, (6, 8, 4, 10)), q=answers(Q, (6, 8, 4, 12)))
     files = [str(folder / f"{name}.csv") for name in "pq"]

@@ -63,7 +63,7 @@ def sample_faces(out: Path, count: int) -> list[Path]:
 
 def prepare(spec: makehuman4d.Spec, *, folder: Path | None = None) -> Path:
     """Make a makehuman4d, or find it made; returns its folder."""
-    noise.check(spec.noise)
+    noise.check_sigma(spec.noise)
     if folder is not None:
         outputs.make_output_folder(folder)
     with outputs.progress(spec.name, spec.subjects) as advance:

@@ -193,7 +193,8 @@ def _data(command: Data) -> None:
     if isinstance(command, Prepare):
         made = datasets.prepare_recordings(
             command.source, command.root, command.out, landmarks=command.landmarks, unit=command.unit,
-            labels=command.labels, people=command.people, cuts=command.cuts, hold=command.hold, most=command.meshes,
+            labels=command.labels, people=command.people, phases=command.cuts,
+            remove_head_motion=command.hold, max_meshes=command.meshes,
             workers=command.workers, rate=command.fps, rest=command.rest, gaps=command.gaps, template=command.template,
             actors=command.actors,
         )  # fmt: skip

@@ -39,19 +39,19 @@ class Motions(NamedTuple):
 
 
 def halves(
-    data: dataset.Dataset, split: str, *, names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
+    data: dataset.Dataset, split: str, *, label_names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
 ) -> Motions:
     """Every neutral -> peak and peak -> neutral motion of a split's subjects.
 
-    `names`: labels that count, neutral first, and their numbers; by default all of the dataset. `by`: frames evenly
+    `label_names`: labels that count, neutral first, and their numbers; by default all of the dataset. `by`: frames evenly
     spaced in "time", or along the "arc", which takes onset and apex away.
     """
-    names = data.labels if names is None else tuple(names)
+    label_names = data.labels if label_names is None else tuple(label_names)
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=False):
-        if sequence.label not in names:
+        if sequence.label not in label_names:
             continue
-        label = names.index(sequence.label)
+        label = label_names.index(sequence.label)
         rise = curve[sequence.onset : sequence.apex_start + 1]
         fall = curve[sequence.apex_end : sequence.offset + 1]
         for cut, start, end in ((rise, 0, label), (fall, label, 0)):
@@ -60,7 +60,7 @@ def halves(
     return _stack(rows)
 
 
-def directs(data: dataset.Dataset, split: str, *, frames: int = FRAMES) -> Motions:
+def direct_transitions(data: dataset.Dataset, split: str, *, frames: int = FRAMES) -> Motions:
     """The directly performed peak -> peak transitions of a split; no capture set has them, evaluation only."""
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=True):
@@ -69,7 +69,7 @@ def directs(data: dataset.Dataset, split: str, *, frames: int = FRAMES) -> Motio
     return _stack(rows)
 
 
-def interpolated(
+def interpolated_transitions(
     onsets: Motions,
     labels: int,
     *,
@@ -77,7 +77,7 @@ def interpolated(
     reuse: int | None = None,
     choice: str = "prototypes",
     time_warp: str = "performed",
-    only: Collection[tuple[int, int]] | None = None,
+    pairs: Collection[tuple[int, int]] | None = None,
     seed: int = 0,
     frames: int = FRAMES,
     chunk: int = 4096,
@@ -86,7 +86,7 @@ def interpolated(
 
     `per_pair` of each ordered pair of expressions; None: all. `choice`: "prototypes", the nearest to the mean peaks of
     the two expressions (OT23; with `reuse`, no onset serves as the start, or as the end, of more than so many
-    transitions of one pair), or "spread", all people equally often. `time_warp` as in `augment.transitions`; `only`: the
+    transitions of one pair), or "spread", all people equally often. `time_warp` as in `augment.transitions`; `pairs`: the
     (start, end) that are wanted.
     """
     if choice not in ("prototypes", "spread"):
@@ -101,9 +101,9 @@ def interpolated(
         prototypes[1:] = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
         count = len(onsets.curves) ** 2 if per_pair is None else per_pair
         chosen = augment.select(peaks, onsets.end, prototypes, per_pair=count, reuse=reuse).pairs
-    if only is not None:
+    if pairs is not None:
         wanted = np.zeros((labels, labels), bool)
-        wanted[tuple(np.array(sorted(only), int).reshape(-1, 2).T)] = True
+        wanted[tuple(np.array(sorted(pairs), int).reshape(-1, 2).T)] = True
         chosen = chosen[wanted[onsets.end[chosen[:, 0]], onsets.end[chosen[:, 1]]]]
     return _between(onsets, motions, chosen, frames, time_warp, chunk)
 

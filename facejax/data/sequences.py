@@ -16,7 +16,7 @@ from facejax.data import dataset, motions
 from facejax.geometry import align
 from facejax.landmarks import schemes
 
-TAIL = 5  # frames of standing still after the end that a network learns from, so that it learns to stop
+TAIL_FRAMES = 5  # frames of standing still after the end that a network learns from, so that it learns to stop
 
 
 class Sequences(NamedTuple):
@@ -88,7 +88,7 @@ def mirror(sequences: Sequences) -> Sequences:
     return sequences._replace(curves=sequences.curves[:, :, swap] * across, neutral=sequences.neutral[:, swap] * across)
 
 
-def without_head_motion(sequences: Sequences, stable: Sequence[int] | None = None) -> Sequences:
+def remove_head_motion(sequences: Sequences, stable: Sequence[int] | None = None) -> Sequences:
     """The same with every frame's rigid motion taken out: Procrustes of the `stable` landmarks onto those at rest.
 
     Seo and Luo 2021, 4.2, tried this and kept the head's motion. `stable` names landmarks that stay put in the head's
@@ -102,7 +102,7 @@ def without_head_motion(sequences: Sequences, stable: Sequence[int] | None = Non
     return sequences._replace(curves=np.asarray(align.apply(pose, placed)) - rest)
 
 
-def block(sequences: Sequences, *, frames: int | None = None, tail: int = TAIL, masked: bool = True) -> Block:
+def block(sequences: Sequences, *, frames: int | None = None, tail: int = TAIL_FRAMES, masked: bool = True) -> Block:
     """The block of f = `frames` entries; by default the longest sequence and its tail fit.
 
     Shorter sequences are padded with zero steps, longer ones cut at the end. The mask leaves out the padding but its

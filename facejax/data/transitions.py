@@ -13,10 +13,10 @@ from facejax.data import dataset, motions
 from facejax.geometry import sphere, srvf
 from facejax.models.motion import start_poses, tangent_pca
 
-RANK = 128  # directions of motion, where there are enough motions to tell
-PER_PAIR = 48  # interpolated transitions of each ordered pair: with 12 labels about the 6,740 of OT23
-SPREAD = 400  # of each ordered pair where everybody meets everybody
-CHARTED = 80  # of each, that a chart is fitted on
+MAX_RANK = 128  # directions of motion, where there are enough motions to tell
+TRANSITIONS_PER_PAIR = 48  # interpolated transitions of each ordered pair: with 12 labels about the 6,740 of OT23
+SPREAD_PER_PAIR = 400  # of each ordered pair where everybody meets everybody
+CHART_PER_PAIR = 80  # of each, that a chart is fitted on
 
 
 class Examples(NamedTuple):
@@ -32,20 +32,20 @@ def transitions(
     data: dataset.Dataset,
     split: str,
     *,
-    names: Sequence[str] | None = None,
-    per_pair: int = PER_PAIR,
+    label_names: Sequence[str] | None = None,
+    per_pair: int = TRANSITIONS_PER_PAIR,
     reuse: int | None = 1,
     time_warp: str = "performed",
 ) -> motions.Motions:
     """OT23's set: halves, and the peak -> peak transitions nearest to the prototypes, between every two expressions.
 
-    `names` as in `data.motions.halves`; `per_pair`, `reuse` and `time_warp` as in `data.motions.interpolated`.
+    `label_names` as in `data.motions.halves`; `per_pair`, `reuse` and `time_warp` as in `data.motions.interpolated_transitions`.
     """
-    halves = motions.halves(data, split, names=names)
+    halves = motions.halves(data, split, label_names=label_names)
     onsets = halves.take(halves.start == 0)
-    count = len(data.labels if names is None else names)
+    count = len(data.labels if label_names is None else label_names)
     return motions.join(
-        halves, *motions.interpolated(onsets, count, per_pair=per_pair, reuse=reuse, time_warp=time_warp)
+        halves, *motions.interpolated_transitions(onsets, count, per_pair=per_pair, reuse=reuse, time_warp=time_warp)
     )
 
 
@@ -53,17 +53,17 @@ def all_pairs(
     data: dataset.Dataset,
     split: str,
     *,
-    names: Sequence[str] | None = None,
-    per_pair: int | None = SPREAD,
+    label_names: Sequence[str] | None = None,
+    per_pair: int | None = SPREAD_PER_PAIR,
     time_warp: str = "performed",
     seed: int = 0,
 ) -> Iterator[motions.Motions]:
     """Halves, and unselected peak -> peak transitions in which everybody meets everybody, part by part."""
-    halves = motions.halves(data, split, names=names)
+    halves = motions.halves(data, split, label_names=label_names)
     yield halves
     onsets = halves.take(halves.start == 0)
-    count = len(data.labels if names is None else names)
-    yield from motions.interpolated(onsets, count, per_pair=per_pair, choice="spread", time_warp=time_warp, seed=seed)
+    count = len(data.labels if label_names is None else label_names)
+    yield from motions.interpolated_transitions(onsets, count, per_pair=per_pair, choice="spread", time_warp=time_warp, seed=seed)
 
 
 def fit_chart(
@@ -95,7 +95,7 @@ def encode_examples(chart: tangent_pca.TangentPCA, parts: motions.Motions | Iter
     return Examples(*(np.concatenate(fields) for fields in zip(*rows, strict=True)))
 
 
-def balanced(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
+def balance_pairs(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
     """Row numbers in which every (start, end) occurs as often as the most frequent one, for training."""
     pair = np.asarray(start) * (max(start.max(), end.max()) + 1) + np.asarray(end)
     most = np.bincount(pair).max()
@@ -103,7 +103,7 @@ def balanced(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.concatenate([np.resize(random.permutation(np.flatnonzero(pair == one)), most) for one in np.unique(pair)])
 
 
-def fit_starts(chart: tangent_pca.TangentPCA, known: motions.Motions) -> start_poses.StartPoses:
+def fit_start_poses(chart: tangent_pca.TangentPCA, known: motions.Motions) -> start_poses.StartPoses:
     """The peaks from which motions start when only a label is known, of the motions that start at one."""
     peaks = known.take((known.start == 0) & (known.end > 0))
     poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(
@@ -117,7 +117,7 @@ def default_rank(known: motions.Motions) -> int:
 
     In directions that few of them take, the flow strays.
     """
-    return min(RANK, len(known.start) // 4)
+    return min(MAX_RANK, len(known.start) // 4)
 
 
 @jax.jit

@@ -106,8 +106,8 @@ def _plan(models: pipeline.Models, request: Request, neutrals: dict[str, np.ndar
     points = len(models.face.landmark_index) + (len(models.face.vertices) if request.meshes else 0)
     each = total * points * 12
     size = max(1, SHARD_BYTES // each) if request.shard is None else request.shard
-    if size < 1 or size * each > npz.LIMIT:
-        raise ValueError(f"shard: {size} sequences of {each} bytes, expected 1 or more, up to {npz.LIMIT} bytes")
+    if size < 1 or size * each > npz.MAX_BYTES:
+        raise ValueError(f"shard: {size} sequences of {each} bytes, expected 1 or more, up to {npz.MAX_BYTES} bytes")
     firsts = range(0, request.count, size)
     if len(firsts) > MOST_SHARDS:
         raise ValueError(f"shard: {size} sequences make {len(firsts)} files, expected up to {MOST_SHARDS}: take more")

@@ -87,7 +87,7 @@ def read_recording(
     whole = livelink.read(path)
     if at_rest:
         # From the whole recording: a part of it may never rest.
-        whole = livelink.above_rest(whole)
+        whole = livelink.subtract_rest(whole)
     even = livelink.resample(whole, rate=rate)
     length = float(even.times[-1])
     chosen = (even.times >= begin - 1e-9) & (even.times < begin + seconds - 1e-9)

@@ -9,7 +9,7 @@ from PIL import Image
 from facejax.io import atomic, glb_writer, meshes
 from facejax.viz import html_viewer, render, scene, video
 
-STRIP = 8  # pictures on a contact strip
+CONTACT_SHEET_FRAMES = 8  # pictures on a contact strip
 
 
 def save(
@@ -86,7 +86,7 @@ def _pictures(shot: scene.Scene, colours, look: dict) -> np.ndarray:
 
 def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
     count = len(shot.vertices)
-    chosen = np.unique(np.linspace(0, count - 1, STRIP).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, CONTACT_SHEET_FRAMES).round().astype(int))
     if colours is not None and np.ndim(colours) == 3:
         colours = np.asarray(colours)[chosen]
     extras = [

@@ -32,7 +32,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         found = _entries(path)
     except (safe_pickle.PickleError, OSError):
         raise
-    except npz.DAMAGE as error:
+    except npz.DAMAGE_ERRORS as error:
         raise ValueError(str(error)) from error
     names = next((pair for pair in _NAMES if all(name in found for name in pair)), None)
     if names is None:
@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _entries(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == ".npz":
         wanted = (*(name for pair in _NAMES for name in pair), *_CONTOUR)
-        return npz.read_some(path, wanted)
+        return npz.read_available(path, wanted)
     with path.open("rb") as stream:
         if path.suffix.lower() == ".npy":
             npz.skip_object_header(stream)

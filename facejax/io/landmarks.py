@@ -23,9 +23,9 @@ import numpy as np
 
 from facejax.io import atomic, flame_embedding
 
-LIMIT = 2**22  # bytes of a file
-MOST = 10_000  # landmarks
-CLOSE = 1e-3  # of the mesh's diagonal: a vertex and the position written beside its number
+MAX_BYTES = 2**22  # bytes of a file
+MAX_LANDMARKS = 10_000  # landmarks
+VERTEX_TOLERANCE = 1e-3  # of the mesh's diagonal: a vertex and the position written beside its number
 _KINDS = (("indices",), ("faces", "weights"), ("points",))
 _ROWS = {1: "index", 3: "x y z", 4: "index x y z"}
 
@@ -63,8 +63,8 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
         if not path.is_file():
             raise LandmarkError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
         size = path.stat().st_size
-        if not 0 < size <= LIMIT:
-            raise LandmarkError(f"{path}: {size} bytes; expected 1 to {LIMIT}")
+        if not 0 < size <= MAX_BYTES:
+            raise LandmarkError(f"{path}: {size} bytes; expected 1 to {MAX_BYTES}")
         found = reader(path if reader is _read_embedding else path.read_bytes(), mesh, faces)
         if mesh is not None:
             _near(found.points, mesh)
@@ -151,8 +151,8 @@ def _placed(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
 
 def _read_embedding(path: Path, mesh, faces) -> Landmarks:
     face, weights = flame_embedding.read(path)
-    if not 0 < len(face) <= MOST:
-        raise ValueError(f"expected 1 to {MOST} landmarks, got {len(face)}")
+    if not 0 < len(face) <= MAX_LANDMARKS:
+        raise ValueError(f"expected 1 to {MAX_LANDMARKS} landmarks, got {len(face)}")
     return Landmarks(_placed(face.tolist(), weights, mesh, faces), None)
 
 
@@ -211,22 +211,22 @@ def _read_text(data: bytes, mesh, faces) -> Landmarks:
             index.append(_index(int(words[0]), where, mesh) if form == 1 or mesh is not None else int(words[0]))
         if form != 1:
             points.append([_number(word, where) for word in words[-3:]])
-            if form == 4 and mesh is not None and math.dist(points[-1], mesh[index[-1]]) > CLOSE * _diagonal(mesh):
+            if form == 4 and mesh is not None and math.dist(points[-1], mesh[index[-1]]) > VERTEX_TOLERANCE * _diagonal(mesh):
                 raise ValueError(
                     f"{where}: vertex {index[-1]} lies at {mesh[index[-1]].tolist()}, not at {points[-1]}: these are "
                     "landmarks of another mesh"
                 )
-        if max(len(index), len(points)) > MOST:
-            raise ValueError(f"{where}: more than {MOST} landmarks")
+        if max(len(index), len(points)) > MAX_LANDMARKS:
+            raise ValueError(f"{where}: more than {MAX_LANDMARKS} landmarks")
     _list(index or points, "landmarks")
     numbers = np.array(index, np.int32) if index else None
     return Landmarks(np.array(points, np.float64) if points else mesh[numbers], numbers)
 
 
 def _list(values, what: str) -> list:
-    if not isinstance(values, list) or not 0 < len(values) <= MOST:
+    if not isinstance(values, list) or not 0 < len(values) <= MAX_LANDMARKS:
         got = f"{len(values)}" if isinstance(values, list) else type(values).__name__
-        raise ValueError(f"{what}: expected a list of 1 to {MOST} landmarks, got {got}")
+        raise ValueError(f"{what}: expected a list of 1 to {MAX_LANDMARKS} landmarks, got {got}")
     return values
 
 

@@ -19,7 +19,7 @@ Angles are in the file's own convention, in radians to all appearance: no docume
 eyes reach 0.6 in it. Eyes' yaw is negative to the subject's left, their pitch positive downward; the head's signs could
 not be checked, so that nothing here turns it.
 
-Shapes: T frames, 52 weights in the order of `NAMES`, U units of the rig.
+Shapes: T frames, 52 weights in the order of `BLENDSHAPES`, U units of the rig.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from facejax.io import atomic
 _SIDED = ("Left", "Right")
 _EYE = ("Blink", "LookDown", "LookIn", "LookOut", "LookUp", "Squint", "Wide")
 _MOUTH = ("Smile", "Frown", "Dimple", "Stretch")
-NAMES = (
+BLENDSHAPES = (
     *(f"eye{move}{side}" for side in _SIDED for move in _EYE),
     *("jawForward", "jawLeft", "jawRight", "jawOpen"),
     *("mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft", "mouthRight"),
@@ -48,13 +48,13 @@ NAMES = (
     *(f"{move}{side}" for move in ("cheekSquint", "noseSneer") for side in _SIDED),
     "tongueOut",
 )
-HEAD = ("headYaw", "headPitch", "headRoll")
-BASES = (24, 25, 30, 60)  # frames per second that a timecode may count in
-LIMIT = 2**28 - 2**26  # bytes of a file
-MOST = 1_000_000  # rows: more than four hours at 60 per second
+HEAD_ANGLES = ("headYaw", "headPitch", "headRoll")
+TIMECODE_RATES = (24, 25, 30, 60)  # frames per second that a timecode may count in
+MAX_BYTES = 2**28 - 2**26  # bytes of a file
+MAX_ROWS = 1_000_000  # rows: more than four hours at 60 per second
 DAY, HALF_DAY = 86_400.0, 43_200.0
-LONG = 1.5  # usual spacings of rows: what is longer is a gap
-WEIGHTS = (-0.5, 2.0)  # ARKit's lie in 0..1, a little above now and then
+GAP_FACTOR = 1.5  # usual spacings of rows: what is longer is a gap
+WEIGHT_RANGE = (-0.5, 2.0)  # ARKit's lie in 0..1, a little above now and then
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,3}(?:\.\d{1,9})?)")
 
 
@@ -63,7 +63,7 @@ class RecordingError(atomic.FileError):
 
 
 class Recording(NamedTuple):
-    """Weights over time; `NAMES` names the columns."""
+    """Weights over time; `BLENDSHAPES` names the columns."""
 
     weights: np.ndarray  # (T, 52) float32
     head: np.ndarray  # (T, 3) float32: yaw, pitch, roll as in the file, radians
@@ -86,8 +86,8 @@ def read(path: str | os.PathLike, *, base: int | None = None, trust_sides: bool 
     path = Path(path)
     try:
         size = path.stat().st_size
-        if not path.is_file() or not 0 < size <= LIMIT:
-            raise RecordingError(f"{path}: {size} bytes; expected a file of 1 to {LIMIT}")
+        if not path.is_file() or not 0 < size <= MAX_BYTES:
+            raise RecordingError(f"{path}: {size} bytes; expected a file of 1 to {MAX_BYTES}")
         lines = _lines(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file") from None
@@ -113,13 +113,13 @@ def resample(recording: Recording, *, rate: float = 30.0, bridge: float = 0.25) 
         the result are those, and a note counts them.
 
     Raises:
-      ValueError: the rate is not positive, or gives more than `MOST` frames.
+      ValueError: the rate is not positive, or gives more than `MAX_ROWS` frames.
     """
     times = recording.times
     if not (np.isfinite(rate) and rate > 0):
         raise ValueError(f"rate must be positive, got {rate}")
-    if times[-1] * rate >= MOST:
-        raise ValueError(f"{times[-1]:.0f} seconds at {rate:g} per second are more than {MOST} frames")
+    if times[-1] * rate >= MAX_ROWS:
+        raise ValueError(f"{times[-1]:.0f} seconds at {rate:g} per second are more than {MAX_ROWS} frames")
     new = np.arange(int(times[-1] * rate + 1e-6) + 1) / rate
     low = np.clip(np.searchsorted(times, new, side="right") - 1, 0, max(len(times) - 2, 0))
     high = np.minimum(low + 1, len(times) - 1)
@@ -133,7 +133,7 @@ def resample(recording: Recording, *, rate: float = 30.0, bridge: float = 0.25) 
     return Recording(weights, head, new, held, notes)
 
 
-def rest(recording: Recording, *, share: float = 0.1) -> np.ndarray:
+def rest_weights(recording: Recording, *, share: float = 0.1) -> np.ndarray:
     """The weights (52,) of the face at rest: the pose that the face comes back to.
 
     It is where the poses lie densest: the frame that has `share` of all frames nearest around it, and of these the
@@ -149,14 +149,14 @@ def rest(recording: Recording, *, share: float = 0.1) -> np.ndarray:
     return np.median(weights[np.argsort(distance[centre], kind="stable")[: count + 1]], axis=0).astype(np.float32)
 
 
-def above_rest(recording: Recording, resting: np.ndarray | None = None) -> Recording:
+def subtract_rest(recording: Recording, resting: np.ndarray | None = None) -> Recording:
     """Weights from rest, w -> max(0, (w - r) / (1 - r)): 0 at rest, 1 where they were 1, so that eyes still close.
 
-    resting: (52,) weights in [0, 1); `rest` of the recording if not given.
+    resting: (52,) weights in [0, 1); `rest_weights` of the recording if not given.
     """
-    resting = np.asarray(rest(recording) if resting is None else resting, np.float32)
-    if resting.shape != (len(NAMES),):
-        raise ValueError(f"resting must be ({len(NAMES)},), got {resting.shape}")
+    resting = np.asarray(rest_weights(recording) if resting is None else resting, np.float32)
+    if resting.shape != (len(BLENDSHAPES),):
+        raise ValueError(f"resting must be ({len(BLENDSHAPES)},), got {resting.shape}")
     # A weight that rests near 1 has no room left, and tells nothing.
     room = np.maximum(1 - np.clip(resting, 0, None), 0.1)
     weights = np.maximum(recording.weights - np.clip(resting, 0, None), 0) / room
@@ -169,28 +169,28 @@ def unit_weights(recording: Recording, units: Sequence[str]) -> np.ndarray:
     Units that are no ARKit shape get 0, such as MakeHuman's own;
     shapes that are no unit are left out, such as the tongue's."""
     weights = np.zeros((len(recording.weights), len(units)), np.float32)
-    for column, name in enumerate(NAMES):
+    for column, name in enumerate(BLENDSHAPES):
         if name in units:
             weights[:, units.index(name)] = recording.weights[:, column]
     return weights
 
 
 def _lines(text: str) -> list[str]:
-    if (count := text.count("\n") - 1) > MOST:  # without the names of the columns
-        raise ValueError(f"{count} rows; at most {MOST}")
+    if (count := text.count("\n") - 1) > MAX_ROWS:  # without the names of the columns
+        raise ValueError(f"{count} rows; at most {MAX_ROWS}")
     return text.splitlines()
 
 
 def _parse(lines: list[str], base: int | None, trust_sides: bool) -> Recording:
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     names = [word[:1].lower() + word[1:] for word in header]
-    missing = [name for name in ("timecode", *NAMES, *HEAD) if name not in names]
+    missing = [name for name in ("timecode", *BLENDSHAPES, *HEAD_ANGLES) if name not in names]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise ValueError(f"line 1: lacks the columns {', '.join(missing[:3])}{more}; is it Live Link Face's CSV?")
-    if len(lines) - 1 > MOST:
-        raise ValueError(f"{len(lines) - 1} rows; at most {MOST}")
-    at = [names.index(name) for name in (*NAMES, *HEAD)]
+    if len(lines) - 1 > MAX_ROWS:
+        raise ValueError(f"{len(lines) - 1} rows; at most {MAX_ROWS}")
+    at = [names.index(name) for name in (*BLENDSHAPES, *HEAD_ANGLES)]
     clocks, rows, numbers, faceless = [], [], [], 0
     for number, line in enumerate(lines[1:], 2):
         words = [word.strip() for word in line.split(",")]
@@ -227,7 +227,7 @@ def _parse(lines: list[str], base: int | None, trust_sides: bool) -> Recording:
     if len(first) < len(rows):
         notes.append(f"left out {len(rows) - len(first)} rows of a time that was there before")
     times = times - times[0]
-    weights, head = np.split(table[first], [len(NAMES)], axis=1)
+    weights, head = np.split(table[first], [len(BLENDSHAPES)], axis=1)
     return Recording(weights, head, times, _gaps(times), tuple(notes))
 
 
@@ -248,12 +248,12 @@ def _base(clock: np.ndarray) -> int:
     Where one second gives way to the next, the step is as long as within a second: (base - frames before) + frames
     after. Without such a place the least base will do that all frames fit in, of 30 and 60.
     """
-    possible = [base for base in BASES if base > clock[:, 1].max()]
+    possible = [base for base in TIMECODE_RATES if base > clock[:, 1].max()]
     second, frame = np.diff(clock, axis=0).T
     within = frame[(second == 0) & (frame > 0)]
     across = frame[second == 1]
     if not possible:
-        return BASES[-1]
+        return TIMECODE_RATES[-1]
     if not len(within) or not len(across):
         return next(base for base in possible if base >= 30)
     found = float(np.median(np.median(within) - across))
@@ -264,13 +264,13 @@ def _row(words: list[str], line: int) -> np.ndarray:
     """The weights, then the head's angles, of one row, (55,) float32, every number checked."""
     values = np.empty(len(words), np.float32)
     for i, word in enumerate(words):
-        low, high = WEIGHTS if i < len(NAMES) else (-2 * np.pi, 2 * np.pi)
+        low, high = WEIGHT_RANGE if i < len(BLENDSHAPES) else (-2 * np.pi, 2 * np.pi)
         try:
             value = float(word)
         except ValueError:
             value = np.nan
         if not low <= value <= high:
-            name = (*NAMES, *HEAD)[i]
+            name = (*BLENDSHAPES, *HEAD_ANGLES)[i]
             got = f"expected a number in {low:.3g}..{high:.3g}, got {word[:40]!r}"
             raise ValueError(f"line {line}, column {name[0].upper()}{name[1:]}: {got}")
         values[i] = value
@@ -282,7 +282,7 @@ def _exchange(table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str
     order, notes = np.arange(table.shape[1]), []
     for part in ("jaw", "mouth"):
         if names.index(f"{part}Left") == names.index(f"{part}Right") + 1:
-            left, right = NAMES.index(f"{part}Left"), NAMES.index(f"{part}Right")
+            left, right = BLENDSHAPES.index(f"{part}Left"), BLENDSHAPES.index(f"{part}Right")
             order[[left, right]] = right, left
             notes.append(f"exchanged {part}Left and {part}Right, which the app's header confuses")
     return table[:, order], notes
@@ -290,5 +290,5 @@ def _exchange(table: np.ndarray, names: list[str]) -> tuple[np.ndarray, list[str
 
 def _gaps(times: np.ndarray) -> tuple[tuple[float, float], ...]:
     step = np.diff(times)
-    long = np.flatnonzero(step > LONG * np.median(step)) if len(step) else []
+    long = np.flatnonzero(step > GAP_FACTOR * np.median(step)) if len(step) else []
     return tuple((float(times[i]), float(step[i])) for i in long)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax.io import atomic, glb_reader, npz, ply
-from facejax.io.npz import DAMAGE, LIMIT
+from facejax.io.npz import DAMAGE_ERRORS, MAX_BYTES
 
 _TEXT_LIMIT = 2**26  # bytes of an OBJ
 _LINE_LIMIT = 2**20
@@ -52,8 +52,8 @@ def read(path: str | os.PathLike) -> Mesh:
         size = path.stat().st_size
         if not path.is_file():
             raise MeshError(f"{path}: not a file")
-        if not 0 < size <= LIMIT:
-            raise MeshError(f"{path}: {size} bytes; expected 1 to {LIMIT}")
+        if not 0 < size <= MAX_BYTES:
+            raise MeshError(f"{path}: {size} bytes; expected 1 to {MAX_BYTES}")
         vertices, faces = reader(path)
     except MeshError:
         raise
@@ -61,7 +61,7 @@ def read(path: str | os.PathLike) -> Mesh:
         raise MeshError(f"{path}: no such file") from None
     except OSError as error:
         raise MeshError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except DAMAGE as error:
+    except DAMAGE_ERRORS as error:
         raise MeshError(f"{path}: {error}") from error
     return _checked(path, vertices, faces)
 
@@ -96,7 +96,7 @@ def count_frames(path: str | os.PathLike) -> int:
     Raises:
       MeshError: as `read_animation`, or other `vertices`.
     """
-    shape = _told(Path(path), npz.shape_in_npz, "vertices")
+    shape = _told(Path(path), npz.npz_shape, "vertices")
     if len(shape) != 3 or 0 in shape or shape[2] != 3:
         raise MeshError(f"{path}: vertices must be (T, N, 3), got {shape}")
     return shape[0]
@@ -171,8 +171,8 @@ def _read_obj(path: Path):
             raise ValueError(f"line {number}: expected 3 or more corners from 1 on: {line[:60]!r}")
         # Negative numbers count back from the latest vertex.
         corner = [i - 1 if i > 0 else len(vertices) // 3 + i for i in corner]
-        if max(map(abs, corner)) > ply.MOST or len(vertices) + len(faces) > 3 * ply.MOST - 3 * len(corner):
-            raise ValueError(f"line {number}: a vertex beyond {ply.MOST}, or more triangles; that many are read")
+        if max(map(abs, corner)) > ply.MAX_ROWS or len(vertices) + len(faces) > 3 * ply.MAX_ROWS - 3 * len(corner):
+            raise ValueError(f"line {number}: a vertex beyond {ply.MAX_ROWS}, or more triangles; that many are read")
         for i in range(1, len(corner) - 1):
             faces.extend((corner[0], corner[i], corner[i + 1]))
     return np.frombuffer(vertices, np.float64).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
@@ -208,7 +208,7 @@ def _told(path: Path, reader, *options):
         return reader(path, *options)
     except FileNotFoundError:
         raise MeshError(f"{path}: no such file") from None
-    except (OSError, *DAMAGE) as error:
+    except (OSError, *DAMAGE_ERRORS) as error:
         raise MeshError(f"{path}: {error}") from error
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-LIMIT = 2**28  # bytes of a file, or of the arrays in it; a head takes a quarter of a megabyte
+MAX_BYTES = 2**28  # bytes of a file, or of the arrays in it; a head takes a quarter of a megabyte
 _DIRECTORY = 2**20  # bytes of an archive's list of members, of which each takes ten times as many when it is read
 # What the readers, and the zip and array parsers below them, raise on damaged input.
-DAMAGE = (
+DAMAGE_ERRORS = (
     ValueError,
     LookupError,
     EOFError,
@@ -37,8 +37,8 @@ def read_npz(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
         names = _names(archive, wanted[0])
         found = {}
         whole = sum(archive.getinfo(f"{name}.npy").file_size for name in wanted if name in names)
-        if whole > LIMIT:
-            raise ValueError(f"its arrays take {whole} bytes, more than {LIMIT}")
+        if whole > MAX_BYTES:
+            raise ValueError(f"its arrays take {whole} bytes, more than {MAX_BYTES}")
         for name in wanted:
             if name in names:
                 with archive.open(f"{name}.npy") as stream:
@@ -46,7 +46,7 @@ def read_npz(path: Path, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
     return found
 
 
-def read_some(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def read_available(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Those of the named arrays that an NPZ holds."""
     with _open(path) as archive:
         there = {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
@@ -54,7 +54,7 @@ def read_some(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     return read_npz(path, found) if found else {}
 
 
-def shape_in_npz(path: Path, name: str) -> tuple[int, ...]:
+def npz_shape(path: Path, name: str) -> tuple[int, ...]:
     """The shape of an array that must be in an NPZ; its numbers are not read."""
     with _open(path) as archive:
         _names(archive, name)
@@ -106,7 +106,7 @@ def _read(stream, size: int, name: str) -> np.ndarray:
     return np.frombuffer(stream.read(need), dtype).reshape(shape, order="F" if fortran else "C")
 
 
-def _header(stream, size: int, name: str, *, limit: int | None = LIMIT) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+def _header(stream, size: int, name: str, *, limit: int | None = MAX_BYTES) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, order, type and bytes that the header claims, held against the size."""
     if limit is not None and size > limit:
         raise ValueError(f"{name}: {size} bytes, more than {limit}")

@@ -16,7 +16,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_LIMIT = 1 << 16
-MOST = 1 << 23  # vertices, or triangles that the faces are cut into
+MAX_ROWS = 1 << 23  # vertices, or triangles that the faces are cut into
 _TEXT_LIMIT = 1 << 26  # bytes of numbers as text, each of which takes up to four times as many as a number
 _RAGGED = 1 << 20  # rows of lists that differ in length: each becomes an array of its own
 
@@ -102,8 +102,8 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
         # No number takes less than a byte, so that a false count is found before anything is made for it.
         if not 0 <= element.rows <= len(data):
             raise ValueError(f"header claims {element.rows} rows of {element.name} in {len(data)} bytes")
-        if element.name in ("vertex", "face") and element.rows > MOST:
-            raise ValueError(f"{element.rows} rows of {element.name}; at most {MOST} are read")
+        if element.name in ("vertex", "face") and element.rows > MAX_ROWS:
+            raise ValueError(f"{element.rows} rows of {element.name}; at most {MAX_ROWS} are read")
     return order, elements, line_end + 1
 
 
@@ -229,8 +229,8 @@ def _words(data: bytes, start: int, size: int = 1 << 20) -> Iterator[list[bytes]
 def _fans(polygons) -> np.ndarray:
     """Triangles (F, 3) int64 of polygons: an array (P, k), or a list of arrays."""
     groups = [polygons] if isinstance(polygons, np.ndarray) else [polygon[None] for polygon in polygons]
-    if (count := sum(len(group) * (group.shape[1] - 2) for group in groups)) > MOST:
-        raise ValueError(f"its faces make {count} triangles; at most {MOST} are read")
+    if (count := sum(len(group) * (group.shape[1] - 2) for group in groups)) > MAX_ROWS:
+        raise ValueError(f"its faces make {count} triangles; at most {MAX_ROWS} are read")
     triangles = [np.zeros((0, 3), np.int64)]
     for group in groups:
         corners = group.shape[1]

@@ -21,7 +21,7 @@ import numpy as np
 from facejax.io import atomic
 
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
-LIMIT = 2**23  # bytes: an empty list of one byte takes 64
+MAX_BYTES = 2**23  # bytes: an empty list of one byte takes 64
 
 
 class PickleError(atomic.FileError):
@@ -32,8 +32,8 @@ def read(path: str | os.PathLike, *, encoding: str = "latin1") -> Any:
     """What a pickle holds, in dicts, lists and arrays. `encoding` is of Python 2's strings. Raises `PickleError`."""
     path = Path(path)
     try:
-        if (size := path.stat().st_size) > LIMIT:
-            raise PickleError(f"{path}: {size} bytes, more than {LIMIT}")
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise PickleError(f"{path}: {size} bytes, more than {MAX_BYTES}")
         with path.open("rb") as stream:
             return load(stream, encoding=encoding)
     except PickleError as error:
@@ -44,9 +44,9 @@ def read(path: str | os.PathLike, *, encoding: str = "latin1") -> Any:
 
 def load(stream, *, encoding: str = "latin1") -> Any:
     """The same from an open file. Raises `PickleError` without a name."""
-    data = stream.read(LIMIT + 1)
-    if len(data) > LIMIT:
-        raise PickleError(f"more than {LIMIT} bytes")
+    data = stream.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise PickleError(f"more than {MAX_BYTES} bytes")
     try:
         return _plain(_Unpickler(io.BytesIO(data), encoding=encoding).load(), {})
     except PickleError:

@@ -11,7 +11,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-import jax
+import ml_dtypes
 import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as _serialise
@@ -20,7 +20,7 @@ from facejax.io import atomic
 
 Tree = Any
 _HEADER = "facejax"
-_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jax.numpy.bfloat16)}
+_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(ml_dtypes.bfloat16)}
 _DTYPES |= {
     f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}")
     for kind in "fiu"
@@ -35,6 +35,8 @@ class WeightsError(atomic.FileError):
 
 def names(tree: Tree) -> dict[str, Any]:
     """The leaves of a tree by name (`a/0/b`), in the order of `jax.tree.leaves`."""
+    import jax
+
     leaves = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
@@ -60,6 +62,8 @@ def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
     Leaves come back as numpy arrays. Raises `WeightsError` naming the file and every leaf that is missing,
     unexpected, or of another shape or dtype.
     """
+    import jax
+
     with _open(path) as file:
         metadata, expected = _metadata(path, file), names(like)
         # Before any memory is taken for numbers.
@@ -95,6 +99,8 @@ def _describe(leaf: Any) -> str:
 
 def _stated(file, name: str) -> Any:
     """Shape and dtype of a tensor, as the header has them; a dtype that is unknown here is void."""
+    import jax
+
     part = file.get_slice(name)
     return jax.ShapeDtypeStruct(tuple(part.get_shape()), _DTYPES.get(part.get_dtype(), np.dtype("V1")))
 

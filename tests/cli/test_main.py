@@ -268,14 +268,14 @@ def test_any_mesh_is_animated_through_transitions(capsys, tmp_path, odd_head):
 
 def recorded(path, count=40):
     """A recording of 30 frames a second: the jaw opens and closes."""
-    names = ["Timecode", "BlendShapeCount", *(n[0].upper() + n[1:] for n in livelink.NAMES)]
+    names = ["Timecode", "BlendShapeCount", *(n[0].upper() + n[1:] for n in livelink.BLENDSHAPES)]
     names += ["HeadYaw", "HeadPitch", "HeadRoll"]
     lines = [",".join(names)]
     for i in range(count):
-        weights = dict.fromkeys(livelink.NAMES, 0.05) | {
+        weights = dict.fromkeys(livelink.BLENDSHAPES, 0.05) | {
             "jawOpen": 0.05 + 0.6 * max(0.0, np.sin(np.pi * (i - 10) / 20))
         }
-        values = [f"{weights[n]:.6f}" for n in livelink.NAMES] + ["0.0"] * 3
+        values = [f"{weights[n]:.6f}" for n in livelink.BLENDSHAPES] + ["0.0"] * 3
         lines.append(",".join([f"10:00:{i // 30:02d}:{i % 30:02d}.000", "61", *values]))
     path.write_text("\n".join(lines))
     return path

@@ -15,7 +15,7 @@ def printed(code, **environment):
 
 
 def test_every_core_is_a_device():
-    code = "import os, jax; from facejax import runtime; runtime.every_core(); n = len(os.sched_getaffinity(0))"
+    code = "import os, jax; from facejax.cli import runtime; runtime.use_all_cores(); n = len(os.sched_getaffinity(0))"
     if not sys.platform.startswith("linux"):
         pytest.skip("no affinity here")
     devices, cores = map(int, printed(f"{code}; print(len(jax.devices()), n)"))
@@ -28,7 +28,7 @@ def test_freed_memory_stays_with_the_process():
         pytest.skip("glibc's allocator is not here")
     code = """
 import resource, numpy as np
-from facejax import runtime
+from facejax.cli import runtime
 told = {keep} and runtime.keep_memory()
 faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 np.ones(10_000_000, np.float32)
@@ -65,7 +65,7 @@ def test_a_job_that_cannot_be_joined_is_refused_at_once(told, message, monkeypat
 
 
 def test_without_a_job_there_is_nothing_to_join():
-    code = "from facejax import runtime\ntry: runtime.join()\nexcept ValueError as error: print(error)"
+    code = "from facejax.cli import runtime\ntry: runtime.join_distributed()\nexcept ValueError as error: print(error)"
     said = " ".join(printed(code))
     assert said.startswith("no job to join") and said.endswith(
         "set JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID"

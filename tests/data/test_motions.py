@@ -117,7 +117,7 @@ def test_a_recording_that_stands_still_has_finite_halves(data):
 
 
 def test_names_choose_and_number_the_labels(data):
-    found, whole = motions.halves(data, "train", frames=6, names=("neutral", "c", "a")), motions.halves(data, "train")
+    found, whole = motions.halves(data, "train", frames=6, label_names=("neutral", "c", "a")), motions.halves(data, "train")
     assert found.curves.shape == (3 * 2 * 2, 6, 4, 3)
     wanted = [{1: 2, 3: 1}[x] for x in whole.end.tolist() if x in (1, 3)]
     assert found.end[found.end > 0].tolist() == wanted
@@ -126,7 +126,7 @@ def test_names_choose_and_number_the_labels(data):
 
 def test_direct_transitions_are_kept_apart():
     data = recorded(direct=((1, 2), (3, 1)))
-    found = motions.directs(data, "train", frames=6)
+    found = motions.direct_transitions(data, "train", frames=6)
     assert [*zip(found.start.tolist(), found.end.tolist(), strict=True)] == [(1, 2), (3, 1)] * 3
     sequence = next(one for one in data.sequences if one.label == "a>b")
     curve = loop_cut(data, sequence, 0, sequence.frames - 1, 6)
@@ -136,7 +136,7 @@ def test_direct_transitions_are_kept_apart():
 
 
 def between(onsets, **options):
-    return motions.join(*motions.interpolated(onsets, 4, frames=6, **options))
+    return motions.join(*motions.interpolated_transitions(onsets, 4, frames=6, **options))
 
 
 def rows_of(onsets, found):
@@ -179,11 +179,11 @@ def test_only_what_is_wanted_and_in_parts_of_any_size(onsets):
     wanted = {(1, 3), (3, 2)}
     whole = between(onsets, per_pair=2)
     mask = np.array([pair in wanted for pair in zip(whole.start.tolist(), whole.end.tolist(), strict=True)])
-    some = [*motions.interpolated(onsets, 4, per_pair=2, only=wanted, frames=6, chunk=3)]
+    some = [*motions.interpolated_transitions(onsets, 4, per_pair=2, pairs=wanted, frames=6, chunk=3)]
     assert [len(part.start) for part in some] == [3, 1]
     for a, b in zip(motions.join(*some), whole.take(mask), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
-    assert [*motions.interpolated(onsets, 4, per_pair=2, only=(), frames=6)] == []
+    assert [*motions.interpolated_transitions(onsets, 4, per_pair=2, pairs=(), frames=6)] == []
 
 
 @pytest.mark.parametrize(
@@ -191,13 +191,13 @@ def test_only_what_is_wanted_and_in_parts_of_any_size(onsets):
     [
         (lambda data, onsets: motions.halves(data, "train", by="length"), 'by: expected "time" or "arc"'),
         (lambda data, onsets: motions.halves(data, "test"), "no such motions in this split"),
-        (lambda data, onsets: motions.directs(data, "train"), "no such motions in this split"),
+        (lambda data, onsets: motions.direct_transitions(data, "train"), "no such motions in this split"),
         (lambda data, onsets: motions.halves(data, "all"), "unknown split 'all'"),
         (lambda data, onsets: between(onsets, per_pair=1, choice="all"), 'choice: expected "prototypes" or "spread"'),
         (lambda data, onsets: between(onsets, per_pair=1, pace="slow"), "pace: expected one of"),
         (lambda data, onsets: between(onsets, per_pair=0, choice="spread"), "per_pair: expected at least 1, got 0"),
         (lambda data, onsets: between(onsets, per_pair=0), "per_pair, reuse: expected at least 1, got 0"),
-        (lambda data, onsets: motions.interpolated(onsets, 5, per_pair=1), "every class at least once"),
+        (lambda data, onsets: motions.interpolated_transitions(onsets, 5, per_pair=1), "every class at least once"),
     ],
 )
 def test_wrong_input_is_named(data, onsets, call, match):

@@ -91,10 +91,10 @@ def test_head_motion_is_taken_out_and_nothing_else():
     placed = data.curves + data.neutral[:, None]
     nodding = np.stack([turned(placed[:, t], 0.05 * t, 0.02 * t) for t in range(5)], axis=1)
     moved = data._replace(curves=(nodding - data.neutral[:, None]).astype(np.float32))
-    still = sequences.without_head_motion(moved, stable=range(4))
+    still = sequences.remove_head_motion(moved, stable=range(4))
     np.testing.assert_allclose(still.curves, data.curves, atol=1e-5)
     with pytest.raises(ValueError, match="no scheme of 6 landmarks"):
-        sequences.without_head_motion(moved)
+        sequences.remove_head_motion(moved)
 
 
 def test_extending_holds_the_last_frame():

@@ -16,10 +16,10 @@ FRAMES = 3
 def quick():
     """Few candidates for what is chosen, and few atoms."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(vertex_error, "ALPHAS", (1e-6, 1e-2))
-        patch.setattr(vertex_error, "FOLDS", 2)
-        patch.setattr(fit_gpmm, "SMOOTH", (0.0, 0.1))
-        patch.setattr(fit_gpmm, "NOISE", (1e-4, 1e-2))
+        patch.setattr(fit_linear, "ALPHAS", (1e-6, 1e-2))
+        patch.setattr(fit_linear, "FOLDS", 2)
+        patch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.0, 0.1))
+        patch.setattr(fit_gpmm, "NOISE_GRID", (1e-4, 1e-2))
         patch.setattr(dictionary, "ATOMS", 12)
         yield
 
@@ -145,7 +145,7 @@ def test_components_of_whole_meshes_are_those_of_faces_and_motion_together(ball_
 
 @pytest.mark.parametrize("by", ["subjects", "labels"])
 def test_what_will_be_new_is_said_to_every_choice(train, tmp_path, monkeypatch, by):
-    monkeypatch.setattr(vertex_error, "fit_linear", lambda model, train, *, by, **fixed: (by, fixed))
+    monkeypatch.setattr(fit_linear, "fit_linear", lambda model, train, *, by, **fixed: (by, fixed))
     monkeypatch.setattr(fit_gpmm, "fit", lambda train, *, by, components: (by, components))
     monkeypatch.setattr(fit_residual, "fit", lambda *args, by, base, **more: (by, base))
     options = baselines.Options(by=by, seed=3, components=7, hierarchy="given")

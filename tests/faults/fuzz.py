@@ -216,7 +216,7 @@ def readers() -> dict[str, Callable[[], Reader]]:
         )
 
     def recording() -> Reader:
-        names = ",".join(["Timecode", "BlendShapeCount", *livelink.NAMES, "HeadYaw", "HeadPitch", "HeadRoll"])
+        names = ",".join(["Timecode", "BlendShapeCount", *livelink.BLENDSHAPES, "HeadYaw", "HeadPitch", "HeadRoll"])
         names += "".join(f",{side}Eye{axis}" for side in ("Left", "Right") for axis in ("Yaw", "Pitch", "Roll"))
         rows = [
             f"13:02:{s:02d}:{f:02d}.000,61," + ",".join(f"{0.01 * i:.3f}" for i in range(61))

@@ -120,7 +120,7 @@ def test_damage_is_named(written, tmp_path):
     for wrong in ("../../etc/passwd", "/etc/passwd", "shards/../../x.npz"):
         index["shards"][0]["file"] = wrong
         (copy / "index.json").write_text(json.dumps(index))
-        with pytest.raises(corpora.CorpusError, match="is no shard's name"):
+        with pytest.raises(corpora.CorpusError, match="invalid shard name"):
             corpora.load(copy)
 
 
@@ -132,8 +132,8 @@ def test_damage_is_named(written, tmp_path):
         ({"unit": "m"}, "expected millimetres"),
         ({"length": None}, "a length in frames"),
         ({"length": 7}, r"landmarks are \(5, 6, 68, 3\), expected \(n, 7, K, 3\)"),
-        ({"labels": ["neutral"]}, "labels: expected numbers below 1"),
-        ({"people": ["average"]}, "person: expected numbers below 1"),
+        ({"labels": ["neutral"]}, "labels: expected integers below 1"),
+        ({"people": ["average"]}, "person: expected integers below 1"),
     ],
 )
 def test_an_index_that_its_shards_go_against_is_refused(written, change, message):

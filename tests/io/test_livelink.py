@@ -18,7 +18,7 @@ def _capital(name):
 
 
 # The app's own header: jaw and mouth name the right side first.
-APP = [_capital(name) for name in livelink.NAMES]
+APP = [_capital(name) for name in livelink.BLENDSHAPES]
 for part in ("Jaw", "Mouth"):
     left, right = APP.index(f"{part}Left"), APP.index(f"{part}Right")
     APP[left], APP[right] = APP[right], APP[left]
@@ -44,7 +44,7 @@ def _csv(path, times, *, base=60, header=HEADER, **columns):
 
 
 def _column(recording, name):
-    return recording.weights[:, livelink.NAMES.index(name)]
+    return recording.weights[:, livelink.BLENDSHAPES.index(name)]
 
 
 TIMES = 47_000 + np.arange(90) / 30
@@ -87,12 +87,12 @@ def test_sides_that_the_app_confuses_are_put_right(path):
     np.testing.assert_allclose(_column(trusted, "mouthLeft"), 0.6, atol=1e-6)
     assert not any("exchanged" in note for note in trusted.notes)
     # A header with left first means what it says.
-    honest = ["Timecode", "BlendShapeCount", *map(_capital, livelink.NAMES), "HeadYaw", "HeadPitch", "HeadRoll"]
+    honest = ["Timecode", "BlendShapeCount", *map(_capital, livelink.BLENDSHAPES), "HeadYaw", "HeadPitch", "HeadRoll"]
     _csv(path, TIMES, header=honest, MouthLeft=0.6)
     np.testing.assert_allclose(_column(livelink.read(path), "mouthLeft"), 0.6, atol=1e-6)
 
 
-@pytest.mark.parametrize("base", livelink.BASES)
+@pytest.mark.parametrize("base", livelink.TIMECODE_RATES)
 def test_the_rate_of_the_timecode_is_inferred(path, base):
     _csv(path, 100 + np.arange(75) / base, base=base)
     found = livelink.read(path)
@@ -154,7 +154,7 @@ def test_resampling_is_linear_and_holds_still_over_long_gaps():
 def test_resampling_refuses_nonsense_and_takes_a_single_row():
     one = livelink.Recording(np.ones((1, 52), np.float32), np.ones((1, 3), np.float32), np.zeros(1))
     np.testing.assert_array_equal(livelink.resample(one).weights, one.weights)
-    assert livelink.rest(one).shape == (52,)
+    assert livelink.rest_weights(one).shape == (52,)
     for rate in (0, -1, np.nan, np.inf):
         with pytest.raises(ValueError, match="rate must be positive"):
             livelink.resample(one, rate=rate)
@@ -172,19 +172,19 @@ def test_rest_is_the_pose_that_the_face_comes_back_to():
         weights[100 * i + 40 : 100 * i + 100] += bump * (pose - quiet)
     weights += rng.normal(0, 0.005, weights.shape)
     recording = livelink.Recording(weights.astype(np.float32), np.zeros((1200, 3)), np.arange(1200) / 30)
-    found = livelink.rest(recording)
+    found = livelink.rest_weights(recording)
     np.testing.assert_allclose(found, quiet, atol=0.01)
-    above = livelink.above_rest(recording)
+    above = livelink.subtract_rest(recording)
     assert above.weights.min() >= 0 and np.abs(above.weights[:40]).max() < 0.05
-    np.testing.assert_array_equal(above.weights, livelink.above_rest(recording, found).weights)
+    np.testing.assert_array_equal(above.weights, livelink.subtract_rest(recording, found).weights)
 
 
 def test_above_rest_keeps_what_is_full():
     recording = livelink.Recording(np.ones((2, 52), np.float32), np.zeros((2, 3)), np.arange(2.0))
-    np.testing.assert_allclose(livelink.above_rest(recording, np.full(52, 0.4)).weights, 1, rtol=1e-6)
-    np.testing.assert_allclose(livelink.above_rest(recording, np.ones(52)).weights, 0)
+    np.testing.assert_allclose(livelink.subtract_rest(recording, np.full(52, 0.4)).weights, 1, rtol=1e-6)
+    np.testing.assert_allclose(livelink.subtract_rest(recording, np.ones(52)).weights, 0)
     with pytest.raises(ValueError, match=r"resting must be \(52,\), got \(3,\)"):
-        livelink.above_rest(recording, np.zeros(3))
+        livelink.subtract_rest(recording, np.zeros(3))
 
 
 def test_unit_weights_drive_the_rig(path):
@@ -194,7 +194,7 @@ def test_unit_weights_drive_the_rig(path):
     assert weights.shape == (3, len(names)) and weights.dtype == np.float32
     np.testing.assert_allclose(weights[:, names.index("eyeBlinkRight")], [0, 0.5, 1])
     assert np.count_nonzero(weights.any(axis=0)) == 2
-    assert set(livelink.NAMES) - set(names) == {"tongueOut"}
+    assert set(livelink.BLENDSHAPES) - set(names) == {"tongueOut"}
     subject = makehuman.subject(100)
     posed = rig.pose(rig.build(subject, level=1), weights)
     moved = np.linalg.norm(posed - posed[0], axis=-1)
@@ -256,10 +256,10 @@ def test_missing_large_and_foreign_files(path, tmp_path, monkeypatch):
     with pytest.raises(livelink.RecordingError, match="not a text in UTF-8"):
         livelink.read(path)
     _csv(path, TIMES[:6])
-    monkeypatch.setattr(livelink, "MOST", 5)
+    monkeypatch.setattr(livelink, "MAX_ROWS", 5)
     with pytest.raises(livelink.RecordingError, match="6 rows; at most 5"):
         livelink.read(path)
-    monkeypatch.setattr(livelink, "LIMIT", 1000)
+    monkeypatch.setattr(livelink, "MAX_BYTES", 1000)
     with pytest.raises(livelink.RecordingError, match="expected a file of 1 to 1000"):
         livelink.read(path)
 
@@ -286,10 +286,10 @@ def test_a_real_recording():
     assert found.weights.shape == (4030, 52) and found.times[-1] == pytest.approx(134.38, abs=0.01)
     np.testing.assert_allclose([gap[0] for gap in found.gaps], [19.83, 70.82, 120.65], atol=0.01)
     np.testing.assert_allclose([gap[1] for gap in found.gaps], 4 / 60, atol=1e-4)
-    resting = livelink.rest(found)
+    resting = livelink.rest_weights(found)
     near = np.linalg.norm(found.weights - resting, axis=1) < 0.25
     assert near.mean() > 0.1 and np.ptp(found.times[near]) > 120
-    above = livelink.resample(livelink.above_rest(found))
+    above = livelink.resample(livelink.subtract_rest(found))
     assert len(above.times) == 4032 and above.gaps == ()
     # Eyes close fully, and the sides agree: the mouth goes where the eye narrows and the corner is stretched.
     assert _column(above, "eyeBlinkLeft").max() > 0.95

@@ -137,7 +137,7 @@ def test_a_face_that_never_moves_is_not_over():
 
 def test_stop_holds_the_face_still(monkeypatch):
     params, *_ = made()
-    monkeypatch.setattr(expression_lstm, "follow", lambda *a: jnp.diff(bump(8, 6, 10, 12), axis=0) + 1e-4)
+    monkeypatch.setattr(expression_lstm, "predict_scheduled", lambda *a: jnp.diff(bump(8, 6, 10, 12), axis=0) + 1e-4)
     monkeypatch.setattr(expression_lstm, "_check", lambda *a: None)
     one = params._replace(scale=params.scale._replace(neutral_mean=jnp.zeros((1, 3))))
     with jax.disable_jit():

@@ -17,7 +17,7 @@ import numpy as np
 
 from facejax.io import atomic, meshes
 
-ALIKE = 3.0  # no mesh of a dataset is so many times as large as another: faces are not, but other units are
+MAX_SIZE_RATIO = 3.0  # no mesh of a dataset is so many times as large as another: faces are not, but other units are
 
 Frame = tuple[str, meshes.Mesh]  # the name for messages, and the mesh
 
@@ -33,7 +33,7 @@ class Person(NamedTuple):
     about: dict[str, Any]
 
 
-class Recording(NamedTuple):
+class RecordingInfo(NamedTuple):
     """One recording."""
 
     subject: int
@@ -51,8 +51,8 @@ class Source(NamedTuple):
     layout: str
     root: Path
     people: tuple[Person, ...]
-    takes: tuple[Recording, ...]  # sorted by subject, then name
-    read: Callable[[Recording, Sequence[int] | None], Iterator[Frame]]  # frames of some numbers, or all
+    takes: tuple[RecordingInfo, ...]  # sorted by subject, then name
+    read: Callable[[RecordingInfo, Sequence[int] | None], Iterator[Frame]]  # frames of some numbers, or all
     rest: Callable[[int], Iterator[Frame]]  # of a subject: meshes whose mean is the face at rest
     files: tuple[Path, ...]  # all that is read
     rate: float
@@ -69,7 +69,7 @@ class Source(NamedTuple):
 
 
 @dataclasses.dataclass
-class Common:
+class ReferenceMesh:
     """What all meshes of a source share, as the first of them has it; the triangles as the first that has any."""
 
     name: str
@@ -88,8 +88,8 @@ class Common:
             if self.faces is None:
                 self.faces, self.faces_of = mesh.faces, name
             self._check_faces(name, mesh.faces)
-        times = size(mesh.vertices) / size(self.vertices)
-        if not 1 / ALIKE < times < ALIKE:
+        times = bounding_box_size(mesh.vertices) / bounding_box_size(self.vertices)
+        if not 1 / MAX_SIZE_RATIO < times < MAX_SIZE_RATIO:
             raise SourceError(f"{name}: {times:.3g} times as large as {self.name}; expected one unit for all meshes")
         return mesh.vertices
 
@@ -102,15 +102,15 @@ class Common:
             raise SourceError(f"{name}: triangle {other[0]} is {got}, expected {expected} as in {self.faces_of}")
 
 
-def common(source: Source) -> Common:
+def reference_mesh(source: Source) -> ReferenceMesh:
     """What the meshes share, as the first subject at rest has it, and the first triangles there are.
 
     Raises `SourceError` where no mesh has any, or one of those before differs.
     """
     name, mesh = next(source.rest(0))
-    if size(mesh.vertices) == 0:
+    if bounding_box_size(mesh.vertices) == 0:
         raise SourceError(f"{name}: all vertices lie at one point")
-    found = Common(name, mesh.vertices, source.faces, str(source.root) if source.faces is not None else "")
+    found = ReferenceMesh(name, mesh.vertices, source.faces, str(source.root) if source.faces is not None else "")
     found.check(name, mesh)
     if source.landmarks_only:
         found.faces = np.zeros((0, 3), np.int32)
@@ -123,7 +123,7 @@ def common(source: Source) -> Common:
     return found
 
 
-def neutral(source: Source, subject: int, shared: Common) -> np.ndarray:
+def neutral_vertices(source: Source, subject: int, shared: ReferenceMesh) -> np.ndarray:
     """A subject at rest (N, 3), in the source's unit: the mean of what `source.rest` gives."""
     found = [shared.check(*frame) for frame in source.rest(subject)]
     return found[0] if len(found) == 1 else np.mean(found, axis=0)
@@ -136,7 +136,7 @@ def fingerprint(source: Source) -> str:
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def size(vertices: np.ndarray) -> float:
+def bounding_box_size(vertices: np.ndarray) -> float:
     """The longest side of the box around vertices (N, 3)."""
     return float(np.ptp(vertices, axis=0).max())
 
@@ -153,7 +153,7 @@ def abbreviate_names(names: Sequence[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def label_of(name: str) -> str:
+def label_from_name(name: str) -> str:
     """The expression that a recording's name says: small letters, without a number at the end ("Happy_02": happy).
 
     A name that is nothing but numbers and marks stays (D3DFACS: "1+2").

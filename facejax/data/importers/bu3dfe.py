@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Person, Recording, Source, SourceError
+from facejax.data.importers.base import Person, RecordingInfo, Source, SourceError
 
 EMOTIONS = {"AN": "angry", "DI": "disgust", "FE": "fear", "HA": "happy", "SA": "sad", "SU": "surprise"}
 LANDMARKS = 66
@@ -50,7 +50,7 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
                 frames = (rest, *levels.values())
                 last = len(frames) - 1
                 takes.append(
-                    Recording(
+                    RecordingInfo(
                         subject, label, f"{name}/{label}", rest.parent, frames, len(frames), (0, last, last, last)
                     )
                 )
@@ -67,7 +67,7 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
         root,
         tuple(Person(name, {"sex": _SEX[name[0].upper()]}) for name in kept),
         tuple(takes),
-        functools.partial(folder_scan.read, rate),
+        functools.partial(folder_scan.read_frames, rate),
         functools.partial(_rest, tuple(neutral)),
         tuple(sorted({*neutral, *(path for take in takes for path in take.frames)})),
         rate,
@@ -82,16 +82,16 @@ def _meshes(root: Path) -> dict[tuple[str, str, int], Path]:
     found: dict[tuple[str, str, int], Path] = {}
     for path in sorted(root.rglob("*"), key=lambda p: base.natural_sort_key(p.as_posix())):
         match = _NAME.fullmatch(path.stem)
-        if match is None or path.suffix.lower() not in folder_scan.SUFFIXES or not path.is_file():
+        if match is None or path.suffix.lower() not in folder_scan.MESH_SUFFIXES or not path.is_file():
             continue
         key = (match[1].upper(), match[2].upper(), int(match[3]))
         if key in found:
             raise SourceError(f"{path}: is {found[key]} already")
         found[key] = path
     if not found:
-        raise SourceError(f"{root}: holds no meshes called F0001_AN01WH_F3D{{{', '.join(folder_scan.SUFFIXES)}}}")
+        raise SourceError(f"{root}: holds no meshes called F0001_AN01WH_F3D{{{', '.join(folder_scan.MESH_SUFFIXES)}}}")
     return found
 
 
 def _rest(neutral: tuple[Path, ...], subject: int):
-    yield str(neutral[subject]), folder_scan.mesh(neutral[subject])
+    yield str(neutral[subject]), folder_scan.read_mesh(neutral[subject])

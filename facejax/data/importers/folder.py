@@ -22,12 +22,12 @@ def prepare(
     landmarks: str | os.PathLike,
     unit: str | None = None,
     rate: float = 30.0,
-    most: int = ingest.MOST,
+    max_meshes: int = ingest.MAX_MESHES,
     progress: ingest.Progress | None = None,
 ) -> dataset.Dataset:
     """`scan` and `ingest.prepare` in one: the meshes under `root` in a new store at `out`.
 
     Raises `SourceError`, and leaves nothing, where something is wrong with the meshes.
     """
-    request = ingest.Request(Path(landmarks), unit, most)
+    request = ingest.Request(Path(landmarks), unit, max_meshes)
     return ingest.prepare(scan(root, rate=float(rate)), out, request, progress=progress)

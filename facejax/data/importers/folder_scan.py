@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from facejax.data.importers import base
-from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
+from facejax.data.importers.base import Frame, Person, RecordingInfo, Source, SourceError
 from facejax.io import meshes
 
-SUFFIXES = (".ply", ".obj", ".npy", ".npz")
-NEUTRAL = "neutral"
-RESTS = ("first", "mean")
+MESH_SUFFIXES = (".ply", ".obj", ".npy", ".npz")
+NEUTRAL_NAME = "neutral"
+REST_OPTIONS = ("first", "mean")
 
 
 def scan(
@@ -46,12 +46,12 @@ def scan(
       SourceError: naming the folder that is amiss.
     """
     root = Path(root)
-    if rest not in RESTS:
-        raise SourceError(f"rest: expected {' or '.join(RESTS)}, got {rest!r}")
+    if rest not in REST_OPTIONS:
+        raise SourceError(f"rest: expected {' or '.join(REST_OPTIONS)}, got {rest!r}")
     people, neutral, takes, stray, notes = [], [], [], [], []
-    for index, folder in enumerate(folders(root, "SUBJECT/RECORDING/*.ply or SUBJECT/RECORDING.npz")):
-        own, there = {}, [p for p in entries(folder) if p.is_dir() or p.suffix.lower() in SUFFIXES]
-        still = [path for path in there if not path.is_dir() and path.stem.lower() == NEUTRAL]
+    for index, folder in enumerate(list_folders(root, "SUBJECT/RECORDING/*.ply or SUBJECT/RECORDING.npz")):
+        own, there = {}, [p for p in list_entries(folder) if p.is_dir() or p.suffix.lower() in MESH_SUFFIXES]
+        still = [path for path in there if not path.is_dir() and path.stem.lower() == NEUTRAL_NAME]
         if len(still) > 1:
             raise SourceError(f"{folder}: {still[0].name} and {still[1].name}, expected one face at rest")
         for path in there:
@@ -85,7 +85,7 @@ def scan(
         root,
         tuple(people),
         tuple(takes),
-        functools.partial(read, rate),
+        functools.partial(read_frames, rate),
         functools.partial(_rest, tuple(neutral), tuple(takes), rate, rest),
         tuple(path for path in neutral if path) + tuple(p for take in takes for p in take.frames or (take.path,)),
         rate,
@@ -93,14 +93,14 @@ def scan(
     )
 
 
-def read(rate: float, take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
+def read_frames(rate: float, take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Frame]:
     """Each frame of a recording, or those of some numbers, with its name for messages; of a folder one at a time.
 
     Raises `SourceError` where a frame cannot be read or is not finite, or an NPZ says another `rate`.
     """
     if take.frames:
         for path in take.frames if which is None else [take.frames[i] for i in which]:
-            yield str(path), mesh(path)
+            yield str(path), read_mesh(path)
         return
     vertices, faces, extra = _told(meshes.read_animation, take.path, bare=True)
     if not abs(extra.get("fps", rate) - rate) <= 1e-3 * rate:
@@ -112,22 +112,22 @@ def read(rate: float, take: Recording, which: Sequence[int] | None) -> Iterator[
         yield f"{take.path}: frame {i}", meshes.Mesh(vertices[i].astype(np.float64), faces)
 
 
-def mesh(path: Path) -> meshes.Mesh:
+def read_mesh(path: Path) -> meshes.Mesh:
     """A mesh of a file. Raises `SourceError`."""
     return _told(meshes.read, path)
 
 
-def folders(root: Path, expected: str) -> list[Path]:
+def list_folders(root: Path, expected: str) -> list[Path]:
     """The folders in a folder, in natural order. Raises `SourceError` where there are none."""
     if not root.is_dir():
         raise SourceError(f"{root}: {'not a folder' if root.exists() else 'no such folder'}")
-    found = [path for path in entries(root) if path.is_dir()]
+    found = [path for path in list_entries(root) if path.is_dir()]
     if not found:
         raise SourceError(f"{root}: holds no folders; expected {expected}")
     return found
 
 
-def entries(folder: Path) -> list[Path]:
+def list_entries(folder: Path) -> list[Path]:
     """What lies in a folder and is not hidden, in natural order. Raises `SourceError`."""
     try:
         return sorted(
@@ -137,24 +137,24 @@ def entries(folder: Path) -> list[Path]:
         raise SourceError(f"{folder}: cannot be read: {error.strerror or error}") from error
 
 
-def _rest(neutral: tuple[Path | None, ...], takes: tuple[Recording, ...], rate: float, rest: str, subject: int):
+def _rest(neutral: tuple[Path | None, ...], takes: tuple[RecordingInfo, ...], rate: float, rest: str, subject: int):
     if (path := neutral[subject]) is not None:
-        yield str(path), mesh(path)
+        yield str(path), read_mesh(path)
         return
     own = [take for take in takes if take.subject == subject]
     for take in own[:1] if rest == "first" else own:
-        yield next(read(rate, take, [0]))
+        yield next(read_frames(rate, take, [0]))
 
 
-def _take(subject: int, name: str, path: Path) -> Recording:
-    if _plain(path) == NEUTRAL:
-        raise SourceError(f"{path}: the face at rest is one mesh, {NEUTRAL}.ply say; give a recording another name")
+def _take(subject: int, name: str, path: Path) -> RecordingInfo:
+    if _plain(path) == NEUTRAL_NAME:
+        raise SourceError(f"{path}: the face at rest is one mesh, {NEUTRAL_NAME}.ply say; give a recording another name")
     if ">" in path.name:  # the mark of a direct transition in a store
         raise SourceError(f"{path}: a recording's name cannot hold '>'")
-    label = base.label_of(_plain(path))
+    label = base.label_from_name(_plain(path))
     frames = _frames_of(path)
     count = len(frames) or _told(meshes.count_frames, path)
-    return Recording(subject, label, f"{name}/{path.name if frames else path.stem}", path, frames, count)
+    return RecordingInfo(subject, label, f"{name}/{path.name if frames else path.stem}", path, frames, count)
 
 
 def _plain(path: Path) -> str:
@@ -166,10 +166,10 @@ def _frames_of(path: Path) -> tuple[Path, ...]:
     """The frames in a folder; none of an NPZ."""
     if not path.is_dir():
         return ()
-    found = tuple(p for p in entries(path) if p.is_file() and p.suffix.lower() in SUFFIXES)
+    found = tuple(p for p in list_entries(path) if p.is_file() and p.suffix.lower() in MESH_SUFFIXES)
     kinds = sorted({p.suffix.lower() for p in found})
     if not found:
-        raise SourceError(f"{path}: holds no frames; expected {', '.join(SUFFIXES)}")
+        raise SourceError(f"{path}: holds no frames; expected {', '.join(MESH_SUFFIXES)}")
     if len(kinds) > 1:  # most likely every frame twice
         raise SourceError(f"{path}: frames in {' and '.join(kinds)}, expected one format")
     return found

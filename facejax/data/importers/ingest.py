@@ -29,11 +29,11 @@ from facejax.landmarks import canonical_frame, schemes
 VERSION = 1
 SEED = 1
 UNITS = {"mm": "millimetres", "cm": "centimetres", "m": "metres"}
-SPREADS = (0.5, 2.0)  # of it: what a named unit may make of 68 landmarks
-SIZES = (40.0, 5000.0)  # mm, of a whole mesh: a face, or all of a person
-OFF = 0.05  # of the mesh's size, that a landmark may lie off its surface
-LEAST = 4  # landmarks: fewer span no space
-MOST = 20_000  # meshes that are stored
+SPREAD_RATIO_RANGE = (0.5, 2.0)  # of it: what a named unit may make of 68 landmarks
+SIZE_RANGE_MM = (40.0, 5000.0)  # mm, of a whole mesh: a face, or all of a person
+MAX_LANDMARK_DISTANCE = 0.05  # of the mesh's size, that a landmark may lie off its surface
+MIN_LANDMARKS = 4  # landmarks: fewer span no space
+MAX_MESHES = 20_000  # meshes that are stored
 Progress = Callable[[int, int], None]
 
 
@@ -42,9 +42,9 @@ class Request(NamedTuple):
 
     landmarks: Path | None
     unit: str | None = None
-    most: int = MOST
-    hold: bool = False  # take the head's rigid motion out
-    cuts: Mapping[int, cuts.Cuts] = {}  # of takes, by number; the others are found
+    max_meshes: int = MAX_MESHES
+    remove_head_motion: bool = False  # take the head's rigid motion out
+    phases: Mapping[int, cuts.Cuts] = {}  # of takes, by number; the others are found
 
 
 def prepare(
@@ -110,10 +110,10 @@ def check_request(recordings: Source, out: Path, request: Request) -> None:
 
 def _job(found: Source, out: Path, request: Request) -> tuple[worker.Job, list[str]]:
     """All that is known before the recordings are read, and what was assumed."""
-    shared = base.common(found)
+    shared = base.reference_mesh(found)
     index, apart = _landmarks(request.landmarks, found, shared)
     unit, scale = _unit(shared, index, request.unit or found.unit)
-    notes = [f"read as {unit}: {shared.name} is {base.size(shared.vertices) * scale:.3g} mm in size"]
+    notes = [f"read as {unit}: {shared.name} is {base.bounding_box_size(shared.vertices) * scale:.3g} mm in size"]
     if apart is not None:
         notes.append(
             f"{request.landmarks}: positions went to the nearest vertices, {apart * scale:.2g} mm away at most"
@@ -121,7 +121,7 @@ def _job(found: Source, out: Path, request: Request) -> tuple[worker.Job, list[s
     if shared_by := len(index) - len(np.unique(index)):
         notes.append(f"{request.landmarks}: {shared_by} of {len(index)} landmarks share a vertex with another")
     notes += _faceless(shared.vertices[index], request.landmarks)
-    neutral = np.stack([worker.to_millimetres(base.neutral(found, i, shared), scale) for i in range(len(found.people))])
+    neutral = np.stack([worker.to_millimetres(base.neutral_vertices(found, i, shared), scale) for i in range(len(found.people))])
     starts = np.cumsum([0, *(take.count for take in found.takes)])
     most = 0 if found.landmarks_only else request.most
     drawn = np.sort(np.random.default_rng([SEED, 2**20]).permutation(int(starts[-1]))[:most])
@@ -207,7 +207,7 @@ def _finish(job: worker.Job, notes: list[str], folder: Path) -> None:
     (folder / "index.json").write_text(json.dumps(index))
 
 
-def _landmarks(path: Path | None, found: Source, shared: base.Common) -> tuple[np.ndarray, float | None]:
+def _landmarks(path: Path | None, found: Source, shared: base.ReferenceMesh) -> tuple[np.ndarray, float | None]:
     """Landmarks as vertices (L,); where the file gives places, how far from its vertex the farthest of them lies."""
     if path is None:
         return found.landmarks.astype(np.int32), None
@@ -215,16 +215,16 @@ def _landmarks(path: Path | None, found: Source, shared: base.Common) -> tuple[n
         marks = landmarks.read(path, shared.vertices, shared.faces)
     except landmarks.LandmarkError as error:
         raise SourceError(str(error)) from error
-    if len(marks.points) < LEAST:
-        raise SourceError(f"{path}: {len(marks.points)} landmarks, expected {LEAST} or more")
+    if len(marks.points) < MIN_LANDMARKS:
+        raise SourceError(f"{path}: {len(marks.points)} landmarks, expected {MIN_LANDMARKS} or more")
     if marks.index is not None:
         return marks.index.astype(np.int32), None
     distance, nearest = cKDTree(shared.vertices).query(marks.points)
-    if distance.max() > OFF * base.size(shared.vertices):
+    if distance.max() > MAX_LANDMARK_DISTANCE * base.bounding_box_size(shared.vertices):
         worst = int(np.argmax(distance))
         raise SourceError(
             f"{path}: landmark {worst} lies {distance[worst]:.3g} off {shared.name}, which is "
-            f"{base.size(shared.vertices):.3g} in size: another unit, or another mesh?"
+            f"{base.bounding_box_size(shared.vertices):.3g} in size: another unit, or another mesh?"
         )
     return nearest.astype(np.int32), float(distance.max())
 
@@ -243,14 +243,14 @@ def _faceless(points: np.ndarray, path: Path | None) -> list[str]:
     return []
 
 
-def _unit(shared: base.Common, index: np.ndarray, unit: str | None) -> tuple[str, float]:
+def _unit(shared: base.ReferenceMesh, index: np.ndarray, unit: str | None) -> tuple[str, float]:
     """The unit's name and its millimetres: as named, by 68 landmarks, or by the size of the whole mesh."""
-    points, size = shared.vertices[index], base.size(shared.vertices)
+    points, size = shared.vertices[index], base.bounding_box_size(shared.vertices)
     known = canonical_frame.template68()
     spread = canonical_frame.spread(points) / canonical_frame.spread(known) if len(index) == len(known) else None
     if unit is not None:
         scale = canonical_frame.UNITS[UNITS[unit]]
-        fits = SIZES[0] < size * scale < SIZES[1] and (spread is None or SPREADS[0] < spread * scale < SPREADS[1])
+        fits = SIZE_RANGE_MM[0] < size * scale < SIZE_RANGE_MM[1] and (spread is None or SPREAD_RATIO_RANGE[0] < spread * scale < SPREAD_RATIO_RANGE[1])
         if not fits:
             raise SourceError(f"{shared.name}: {size * scale:.3g} mm in size, read as {UNITS[unit]}: another unit?")
         return UNITS[unit], scale

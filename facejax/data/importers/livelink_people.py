@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
+from facejax.data.importers.base import Frame, Person, RecordingInfo, Source, SourceError
 from facejax.data.synthetic import assets, makehuman, makehuman4d, rig
 from facejax.io import livelink, meshes
 
@@ -33,7 +33,7 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level
       level: realism of the faces, 0 to 3.
     """
     root = Path(root)
-    performers = [folder for folder in folder_scan.entries(root) if folder.is_dir()] if root.is_dir() else []
+    performers = [folder for folder in folder_scan.list_entries(root) if folder.is_dir()] if root.is_dir() else []
     performers = [folder for folder in performers if _csv(folder)] or [root]
     recordings = [_csv(folder) for folder in performers]
     if not any(recordings):
@@ -46,7 +46,7 @@ def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level
     for person in range(actors):
         for path in recordings[person % len(performers)]:
             name = f"{_name(performers, person, root)}/{path.stem}"
-            takes.append(Recording(person, base.label_of(path.stem), name, path, (), counts[path]))
+            takes.append(RecordingInfo(person, base.label_from_name(path.stem), name, path, (), counts[path]))
     loaded = assets.load()
     return Source(
         "livelink",
@@ -74,14 +74,14 @@ def _name(performers: list[Path], person: int, root: Path) -> str:
 
 
 def _csv(folder: Path) -> list[Path]:
-    return [path for path in folder_scan.entries(folder) if path.suffix.lower() == ".csv"] if folder.is_dir() else []
+    return [path for path in folder_scan.list_entries(folder) if path.suffix.lower() == ".csv"] if folder.is_dir() else []
 
 
 @functools.lru_cache(maxsize=4)
 def _weights(path: Path, rate: float) -> tuple[np.ndarray, tuple[str, ...]]:
     """The rig's weights (T, U) above the performer's resting face, evenly sampled, and what was assumed."""
     try:
-        even = livelink.resample(livelink.above_rest(livelink.read(path)), rate=rate)
+        even = livelink.resample(livelink.subtract_rest(livelink.read(path)), rate=rate)
     except livelink.RecordingError as error:
         raise SourceError(str(error)) from error
     return livelink.unit_weights(even, rig.unit_names()), even.notes
@@ -92,7 +92,7 @@ def _rig(person: int, level: int) -> rig.Rig:
     return rig.build(makehuman.subject(person, seed=makehuman4d.SEED), level=level)
 
 
-def _read(rate: float, level: int, take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
+def _read(rate: float, level: int, take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Frame]:
     weights, skin = _weights(take.path, rate)[0], assets.load().skin
     numbers = np.arange(len(weights)) if which is None else np.asarray(which)
     for low in range(0, len(numbers), CHUNK):

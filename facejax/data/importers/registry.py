@@ -45,9 +45,9 @@ def prepare(
     unit: str | None = None,
     labels: Path | None = None,
     people: Path | None = None,
-    cuts: Path | None = None,
-    hold: bool = False,
-    most: int = ingest.MOST,
+    phases: Path | None = None,
+    remove_head_motion: bool = False,
+    max_meshes: int = ingest.MAX_MESHES,
     workers: int | None = None,
     progress: ingest.Progress | None = None,
     **options: Any,
@@ -59,7 +59,7 @@ def prepare(
       root: the folder of the recordings.
       out: of the store; it must not be there yet.
       landmarks, unit, most, workers, progress: see `ingest.prepare`.
-      labels, people, cuts: tables; see `with_labels`, `with_people` and `cuts_of`.
+      labels, people, cuts: tables; see `with_labels`, `with_people` and `read_phases`.
       hold: take the head's rigid motion out.
       options: the layout's own; those that are None are left to it.
 
@@ -71,8 +71,8 @@ def prepare(
         found = with_labels(found, labels)
     if people is not None:
         found = with_people(found, people)
-    named = {} if cuts is None else cuts_of(found, cuts)
-    request = ingest.Request(landmarks, unit, most, hold, named)
+    named = {} if phases is None else read_phases(found, phases)
+    request = ingest.Request(landmarks, unit, max_meshes, remove_head_motion, named)
     return ingest.prepare(found, out, request, workers=workers, progress=progress)
 
 
@@ -123,7 +123,7 @@ def with_people(found: Source, path: Path) -> Source:
     return found._replace(people=tuple(Person(who.name, about[who.name]) for who in found.people))
 
 
-def cuts_of(found: Source, path: Path) -> dict[int, apex_detection.Cuts]:
+def read_phases(found: Source, path: Path) -> dict[int, apex_detection.Phases]:
     """The cuts of recordings, by number, from a table of subject, recording and `cuts.Cuts`' fields."""
-    rows = tables.read(path, ("subject", "recording", *apex_detection.Cuts._fields), ())
-    return apex_detection.cuts_from_table(rows, found.takes, [who.name for who in found.people])
+    rows = tables.read(path, ("subject", "recording", *apex_detection.Phases._fields), ())
+    return apex_detection.phases_from_table(rows, found.takes, [who.name for who in found.people])

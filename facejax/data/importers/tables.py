@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from facejax.data.importers.base import SourceError
 
-LIMIT = 2**24  # bytes
+MAX_BYTES = 2**24  # bytes
 
 
 class Row(NamedTuple):
@@ -37,8 +37,8 @@ def read(path: str | os.PathLike, needed: Collection[str], allowed: Collection[s
     """
     path = Path(path)
     try:
-        if path.stat().st_size > LIMIT:
-            raise SourceError(f"{path}: more than {LIMIT} bytes")
+        if path.stat().st_size > MAX_BYTES:
+            raise SourceError(f"{path}: more than {MAX_BYTES} bytes")
         text = path.read_text("utf-8-sig")
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror or error}") from error

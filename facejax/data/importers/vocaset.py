@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from facejax.data.importers import base, folder_scan
-from facejax.data.importers.base import Frame, Person, Recording, Source, SourceError
+from facejax.data.importers.base import Frame, Person, RecordingInfo, Source, SourceError
 from facejax.io import meshes, npz, safe_pickle
 
 RATE = 60.0
@@ -43,7 +43,7 @@ def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = 
         raise SourceError(f"{paths[0]}: {error}") from error
     if vertices.ndim != 3 or vertices.shape[2] != 3:
         raise SourceError(f"{paths[0]}: expected (rows, N, 3), got {vertices.shape}")
-    topology = folder_scan.mesh(template)
+    topology = folder_scan.read_mesh(template)
     if topology.faces is None or len(topology.vertices) != vertices.shape[1]:
         raise SourceError(
             f"{template}: expected a mesh of {vertices.shape[1]} vertices with triangles, as {FILES[0]} has, "
@@ -58,8 +58,8 @@ def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = 
             where = f"{paths[1]}: {name}/{sentence}"
             rows, odd = _rows(_dict(frames, paths[1], name, sentence), len(vertices), where, gaps)
             notes += odd
-            take = Recording(
-                len(people), base.label_of(sentence), f"{name}/{sentence}", Path(name) / sentence, (), len(rows)
+            take = RecordingInfo(
+                len(people), base.label_from_name(sentence), f"{name}/{sentence}", Path(name) / sentence, (), len(rows)
             )
             takes.append((take, rows))
         people.append(Person(str(name), {}))
@@ -112,7 +112,7 @@ def _dict(value: Any, path: Path, *keys: str) -> dict:
     return value
 
 
-def _read(path: Path, table: dict[str, np.ndarray], take: Recording, which: Sequence[int] | None) -> Iterator[Frame]:
+def _read(path: Path, table: dict[str, np.ndarray], take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Frame]:
     vertices, rows = npz.map_npy(path), table[take.name]
     for i in range(len(rows)) if which is None else which:
         frame = np.asarray(vertices[rows[i]], np.float64)

@@ -22,14 +22,14 @@ from facejax.data.importers.base import SourceError
 from facejax.io import atomic
 from facejax.landmarks import schemes
 
-MANY = 2_000  # frames, from which on other processes are worth their start
+MIN_PARALLEL_FRAMES = 2_000  # frames, from which on other processes are worth their start
 
 
 class Job(NamedTuple):
     """All that a recording is read with."""
 
     source: base.Source
-    common: base.Common
+    common: base.ReferenceMesh
     index: np.ndarray  # (L,) int32 landmarks as vertices
     unit: str  # its name
     scale: float  # its millimetres
@@ -38,14 +38,14 @@ class Job(NamedTuple):
     drawn: np.ndarray  # (G,) rows whose meshes are kept
     part: Path  # the folder of what is done
     hold: np.ndarray | None  # landmarks that stay put in the head's own frame, to take its motion out
-    cuts: dict[int, apex_detection.Cuts]
+    cuts: dict[int, apex_detection.Phases]
 
 
 class Result(NamedTuple):
     """A recording that was read."""
 
     curve: np.ndarray  # (T, L, 3) float32 mm
-    cuts: apex_detection.Cuts
+    cuts: apex_detection.Phases
     restless: tuple[bool, bool]  # does not begin, does not end at rest
     visits: int  # how often it goes to an expression and comes home
     jumps: list[int]
@@ -56,7 +56,7 @@ def import_all(job: Job, workers: int | None, progress: Callable[[int, int], Non
     total = len(job.source.takes)
     todo = [number for number in range(total) if not _path(job, number).exists()]
     frames = sum(job.source.takes[number].count for number in todo)
-    workers = workers or (min(os.cpu_count() or 1, len(todo)) if frames > MANY else 1)
+    workers = workers or (min(os.cpu_count() or 1, len(todo)) if frames > MIN_PARALLEL_FRAMES else 1)
     if workers <= 1:
         for done, number in enumerate(todo, 1):
             import_recording(job, number)
@@ -98,20 +98,20 @@ def import_recording(job: Job, number: int) -> None:
     if kept is not None:
         kept.flush()
     marks = rest[job.index]
-    if apex_detection.energy(curve, marks).max() < apex_detection.STILL:
+    if apex_detection.mean_displacement(curve, marks).max() < apex_detection.MIN_MOTION_MM:
         raise SourceError(f"{take.path}: its landmarks never leave the face at rest, expected a motion")
     cut = job.cuts.get(number) or take.cuts or apex_detection.detect(curve, marks)
-    restless = apex_detection.not_at_rest(curve, marks, apex_detection.Cuts(*cut))
+    restless = apex_detection.not_at_rest(curve, marks, apex_detection.Phases(*cut))
     with atomic.replace_file(_path(job, number)) as temporary:
         visits = apex_detection.count_returns(curve, marks)
-        jumps = np.array(apex_detection.jumps(curve), np.int64)
+        jumps = np.array(apex_detection.detect_jumps(curve), np.int64)
         np.savez(temporary, curve=curve, cuts=cut, restless=restless, visits=visits, jumps=jumps)
 
 
 def load_result(job: Job, number: int) -> Result:
     """What `import_recording` left."""
     with np.load(_path(job, number), allow_pickle=False) as found:
-        cut = apex_detection.Cuts(*found["cuts"].tolist())
+        cut = apex_detection.Phases(*found["cuts"].tolist())
         restless, visits = tuple(found["restless"].tolist()), int(found["visits"])
         return Result(found["curve"], cut, restless, visits, found["jumps"].tolist())
 

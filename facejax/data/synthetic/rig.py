@@ -93,7 +93,7 @@ def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
     if rig.contact is not None:
         moved = contact.separate_lips(rig.contact, contact.slide_lids(rig.contact, moved))
     if rig.skin is not None:
-        moved = skin.fold(rig.skin, moved)
+        moved = skin.add_wrinkles(rig.skin, moved)
     return moved
 
 

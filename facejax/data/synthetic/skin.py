@@ -71,7 +71,7 @@ def build(subject: makehuman.Subject) -> Skin:
     )
 
 
-def fold(skin: Skin, vertices: np.ndarray) -> np.ndarray:
+def add_wrinkles(skin: Skin, vertices: np.ndarray) -> np.ndarray:
     """Posed vertices (T, M, 3) -> the same with furrows and bulges on the skin, (T, M, 3)."""
     faces, pattern = assets.load().faces, template_pattern()
     n = len(skin.height)

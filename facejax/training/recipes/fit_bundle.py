@@ -40,13 +40,13 @@ def fit(
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = mesh_hierarchy.build(mean, faces)
-    known = motions.join(*transitions.all_pairs(data, "train", names=data.labels, per_pair=transitions.CHARTED))
+    known = motions.join(*transitions.all_pairs(data, "train", label_names=data.labels, per_pair=transitions.CHART_PER_PAIR))
     chart = transitions.fit_chart(known, labels=len(data.labels), rank=transitions.default_rank(known))
     examples = transitions.encode_examples(
-        chart, transitions.all_pairs(data, "train", names=data.labels, per_pair=transitions.SPREAD)
+        chart, transitions.all_pairs(data, "train", label_names=data.labels, per_pair=transitions.SPREAD_PER_PAIR)
     )
     generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed, mesh=mesh)
-    beginnings = transitions.fit_starts(chart, motions.halves(data, "train"))
+    beginnings = transitions.fit_start_poses(chart, motions.halves(data, "train"))
     train = mesh_subset.of_split(data, "train")
     # As many components as the file will hold: the network refines the very answer that it will meet.
     base = fit_gpmm.fit(train, components=bundle.COMPONENTS)

@@ -211,7 +211,7 @@ def fit_reference(
 
 
 def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, mesh):
-    rows = transitions.balanced(examples.start, examples.end, seed)
+    rows = transitions.balance_pairs(examples.start, examples.end, seed)
     order = loop.epoch_indices(seed, len(rows), batch)
     conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
     held = (jnp.asarray(examples.values), conditions), chart

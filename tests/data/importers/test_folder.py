@@ -106,7 +106,7 @@ def test_a_draw_of_the_meshes(capture, ball):
     assert data.vertices.shape == (50, 162, 3) and data.landmarks.shape == (132, 5, 3)
     assert np.all(np.diff(data.drawn) > 0) and len({s.subject for s in data.sequences}) == 6
     np.testing.assert_array_equal(data.vertices[:, MARKS], data.landmarks[data.drawn])
-    again = folder.prepare(capture, capture.parent / "again", landmarks=capture.parent / "marks.json", most=50)
+    again = folder.prepare(capture, capture.parent / "again", landmarks=capture.parent / "marks.json", max_meshes=50)
     assert again.index["hashes"] == data.index["hashes"]
 
 

@@ -30,7 +30,7 @@ def test_every_performer_plays_people_of_their_own(takes, tmp_path):
         (i, "mouth_open", n) for i in range(4) for n in (36, 38)
     ]
     # What the rig makes of the recording's weights above rest.
-    even = livelink.resample(livelink.above_rest(livelink.read(takes / "ben" / "mouth_open_01.csv")), rate=30)
+    even = livelink.resample(livelink.subtract_rest(livelink.read(takes / "ben" / "mouth_open_01.csv")), rate=30)
     person = makehuman.subject(1)
     posed = rig.pose(rig.build(person, level=1), livelink.unit_weights(even, rig.unit_names()))[
         :, : len(person.vertices)

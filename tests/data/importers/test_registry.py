@@ -319,7 +319,7 @@ def test_landmarks_that_are_no_face_are_said(capture, marks, tiny_store):
 def test_jumps_are_named():
     curve = np.cumsum(np.full((40, 5, 3), 0.1), axis=0)
     curve[25:] += 4.0
-    assert apex_detection.jumps(curve) == [25] and apex_detection.jumps(curve[:25]) == []
+    assert apex_detection.detect_jumps(curve) == [25] and apex_detection.detect_jumps(curve[:25]) == []
 
 
 def test_the_same_bytes_by_any_number_of_processes_and_after_kills(capture, marks, tmp_path):
@@ -329,9 +329,9 @@ def test_the_same_bytes_by_any_number_of_processes_and_after_kills(capture, mark
     two = prepared(root, marks, out="two", workers=2)
     assert _bytes(whole) == _bytes(two)
     code = (
-        "import sys; from pathlib import Path; from facejax.data import layouts\n"
+        "import sys; from pathlib import Path; from facejax.data.importers import registry\n"
         "print('begun', flush=True)\n"
-        "layouts.prepare('coma', Path(sys.argv[1]), Path(sys.argv[2]), landmarks=Path(sys.argv[3]),"
+        "registry.prepare('coma', Path(sys.argv[1]), Path(sys.argv[2]), landmarks=Path(sys.argv[3]),"
         " workers=int(sys.argv[4]), progress=lambda done, total: print(done, flush=True))"
     )
     killed = 0
@@ -388,11 +388,11 @@ def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_p
             raise KeyboardInterrupt
         real(job, number)
 
-    monkeypatch.setattr(worker, "do", stop)
+    monkeypatch.setattr(worker, "import_recording", stop)
     with pytest.raises(KeyboardInterrupt):
         prepared(root, marks)
     assert len(list((tmp_path / ".store.part" / "done").iterdir())) == 2
-    monkeypatch.setattr(worker, "do", lambda job, number: (seen.append(number), real(job, number)))
+    monkeypatch.setattr(worker, "import_recording", lambda job, number: (seen.append(number), real(job, number)))
     prepared(root, marks, most=20)
     assert seen[3:] == [0, 1, 2, 3, 4, 5]
 
@@ -407,11 +407,11 @@ def test_trouble_that_is_not_of_the_recordings_loses_nothing(capture, marks, tmp
             raise trouble
         real(job, number)
 
-    monkeypatch.setattr(worker, "do", fail)
+    monkeypatch.setattr(worker, "import_recording", fail)
     with pytest.raises(type(trouble)):
         prepared(root, marks)
     assert not (tmp_path / "store").exists()
-    monkeypatch.setattr(worker, "do", lambda job, number: (seen.append(number), real(job, number)))
+    monkeypatch.setattr(worker, "import_recording", lambda job, number: (seen.append(number), real(job, number)))
     assert _bytes(prepared(root, marks)) == _bytes(whole) and seen == [2, 3, 4, 5]
 
 

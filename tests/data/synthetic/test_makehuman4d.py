@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facejax.data import dataset, motions
-from facejax.data.synthetic import makehuman, makehuman4d, performance, rig
+from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d, performance, rig
 
 
 def test_same_seed_same_bytes(tiny_spec, tiny_store, tmp_path):
@@ -17,7 +17,7 @@ def test_same_seed_same_bytes(tiny_spec, tiny_store, tmp_path):
 
 def test_index_says_what_is_there(tiny_store, tiny_spec):
     assert [s["split"] for s in tiny_store.index["subjects"]] == ["train"] * 4 + ["validation", "test"]
-    assert tiny_store.labels == performance.LABELS
+    assert tiny_store.labels == expression_recipes.LABELS
     direct = [s for s in tiny_store.sequences if ">" in s.label]
     # The 39 pairs less the six that start or end at neutral, for validation and test alone.
     assert len(direct) == 2 * 33 and {s.subject for s in direct} == {4, 5}
@@ -44,8 +44,8 @@ def test_drawn_meshes_carry_their_landmarks(tiny_store):
 
 
 def test_table_5_has_39_transitions_of_13_starts():
-    assert len(makehuman4d.PAIRS) == 39 and len({a for a, _ in makehuman4d.PAIRS}) == 13
-    assert all(a != b and {a, b} <= set(performance.LABELS) for a, b in makehuman4d.PAIRS)
+    assert len(makehuman4d.TABLE5_PAIRS) == 39 and len({a for a, _ in makehuman4d.TABLE5_PAIRS}) == 13
+    assert all(a != b and {a, b} <= set(expression_recipes.LABELS) for a, b in makehuman4d.TABLE5_PAIRS)
 
 
 def test_head_motion_is_rigid_and_leans_back(template):
@@ -71,7 +71,7 @@ def test_halves_run_between_neutral_and_peak(tiny_store):
 def test_interpolated_transitions_join_the_peaks(tiny_store):
     halves = motions.halves(tiny_store, "train")
     onsets = halves.take(halves.start == 0)
-    found = motions.join(*motions.interpolated(onsets, 19, per_pair=3, reuse=1))
+    found = motions.join(*motions.interpolated_transitions(onsets, 19, per_pair=3, reuse=1))
     assert len(found.curves) == 18 * 17 * 3
     first = found.take((found.start == 1) & (found.end == 2))
     ends = onsets.curves[onsets.end == 2][:, -1]

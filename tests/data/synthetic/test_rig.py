@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facejax.data.synthetic import assets, contact, makehuman, performance, rig, skin
+from facejax.data.synthetic import assets, contact, expression_recipes, makehuman, performance, rig, skin
 from facejax.mesh import deformation_transfer
 
 
@@ -19,7 +19,7 @@ def rigs(subject):
 
 @pytest.fixture(scope="module")
 def peaks():
-    return np.stack([performance.peak(label, 10) for label in performance.EXPRESSIONS])
+    return np.stack([performance.apex_weights(label, 10) for label in expression_recipes.EXPRESSIONS])
 
 
 def unit(**weights):
@@ -139,11 +139,11 @@ def test_gradient_of_a_linear_function_is_its_slope_in_the_plane(template):
 def test_skin_folds_only_where_it_is_compressed(rigs):
     posed = rigs[3].skin
     rest = rigs[3].neutral[None]
-    np.testing.assert_allclose(skin.fold(posed, rest), rest, atol=2e-5)
+    np.testing.assert_allclose(skin.add_wrinkles(posed, rest), rest, atol=2e-5)
     # Stretching everything leaves every direction longer: nothing may fold.
-    np.testing.assert_allclose(skin.fold(posed, 1.2 * rest), 1.2 * rest, atol=2e-4)
+    np.testing.assert_allclose(skin.add_wrinkles(posed, 1.2 * rest), 1.2 * rest, atol=2e-4)
     squeezed = rest * np.array([1, 0.8, 1], np.float32)
-    assert np.linalg.norm(skin.fold(posed, squeezed) - squeezed, axis=-1).max() > 0.3
+    assert np.linalg.norm(skin.add_wrinkles(posed, squeezed) - squeezed, axis=-1).max() > 0.3
 
 
 def test_older_skin_folds_deeper(subject):

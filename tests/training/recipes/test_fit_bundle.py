@@ -17,11 +17,11 @@ PLANS = fit_bundle.Plans(fit_motion.FlowPlan(steps=2, batch=8), fit_residual.Res
 def few():
     """Few candidates for the prior, few motions."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(transitions, "SPREAD", 2)
-        patch.setattr(transitions, "CHARTED", 2)
+        patch.setattr(transitions, "SPREAD_PER_PAIR", 2)
+        patch.setattr(transitions, "CHART_PER_PAIR", 2)
         patch.setattr(fit_gpmm, "FOLDS", 2)
-        patch.setattr(fit_gpmm, "SMOOTH", (0.12,))
-        patch.setattr(fit_gpmm, "NOISE", (1e-2,))
+        patch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.12,))
+        patch.setattr(fit_gpmm, "NOISE_GRID", (1e-2,))
         patch.setattr(fit_gpmm, "JUDGED", 1)
         yield
 
@@ -61,7 +61,7 @@ def test_few_motions_make_a_small_chart(tiny_store, tmp_path, monkeypatch):
     def chart_of(known, *, labels, rank):
         raise Seen(len(known.start), labels, rank)
 
-    monkeypatch.setattr(transitions, "chart_of", chart_of)
+    monkeypatch.setattr(transitions, "fit_chart", chart_of)
     named = {label: tiny_store.labels.index(label) for label in ("neutral", "anger", "high_smile")}
     few = tiny_store._replace(
         index=tiny_store.index | {"labels": list(named)},
@@ -70,10 +70,10 @@ def test_few_motions_make_a_small_chart(tiny_store, tmp_path, monkeypatch):
     with pytest.raises(Seen) as seen:
         fit_bundle.fit(few, tmp_path)
     motions, labels, rank = seen.value.args
-    assert labels == 3 and rank == motions // 4 < transitions.RANK
+    assert labels == 3 and rank == motions // 4 < transitions.MAX_RANK
     with pytest.raises(Seen) as seen:
         fit_bundle.fit(tiny_store, tmp_path)
-    assert seen.value.args[2] == transitions.RANK
+    assert seen.value.args[2] == transitions.MAX_RANK
 
 
 def test_what_cannot_be_learnt_from_is_named(tiny_store):
@@ -94,7 +94,7 @@ def test_the_command_trains_and_says_what_it_made(few, tiny_store, tmp_path, mon
         return pipeline.load()
 
     monkeypatch.setattr(fit_bundle, "fit", fit)
-    monkeypatch.setattr(fit_bundle, "judge", lambda models, data: {"head": 0.0123, "face": 0.0456})
+    monkeypatch.setattr(vertex_error, "of_models", lambda models, data: {"head": 0.0123, "face": 0.0456})
     out = tmp_path / "new" / "m.safetensors"
     main.main(["fit", "--data", str(tiny_store.path), "--out", str(out), "--quick", "--seed", "3"])
     assert "0.012 mm over the mesh, 0.046 mm over the face" in capsys.readouterr().out

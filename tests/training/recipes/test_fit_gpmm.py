@@ -35,7 +35,7 @@ def test_all_priors_are_tried_and_the_best_is_carried(fitted):
 
 @pytest.mark.parametrize(("worth", "wanted"), [(0.0, (False, 0.0)), (1e9, None)], ids=["simplest", "best"])
 def test_the_simpler_is_taken_unless_the_better_is_worth_it(train, monkeypatch, worth, wanted):
-    monkeypatch.setattr(fit_gpmm, "WORTH", worth)
+    monkeypatch.setattr(fit_gpmm, "MIN_RELATIVE_GAIN", worth)
     found = fit_gpmm.fit(train, components=COMPONENTS)
     error = found.errors_mm[found.params.prior]
     if wanted is None:
@@ -60,7 +60,7 @@ def test_what_is_fitted_is_the_model_of_all_meshes_under_that_prior(fitted, trai
 @pytest.mark.parametrize("by", ["subjects", "labels"])
 def test_answers_held_out_are_those_of_a_model_that_saw_nothing_alike(train, monkeypatch, by):
     """Plain and without the smooth prior: ridge regression of every second mesh of the others."""
-    monkeypatch.setattr(fit_gpmm, "SMOOTH", (0.0,))
+    monkeypatch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.0,))
     found = fit_gpmm.fit(train, by=by, carried=(False,))
     of = train.owner if by == "subjects" else train.labels
     answers = found.held_out(train)

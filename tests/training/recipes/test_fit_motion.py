@@ -10,7 +10,7 @@ import pytest
 
 from facejax import augment
 from facejax.data import motions, transitions
-from facejax.data.synthetic import performance
+from facejax.data.synthetic import expression_recipes
 from facejax.models.motion import flow_matching, generators, motion3dgan, motion3dgan_reference, tangent_pca
 from facejax.training import loop
 from facejax.training.recipes import fit_motion
@@ -74,8 +74,8 @@ def test_wrong_requests_are_named(known, chart, examples, tmp_path):
 
 def test_the_papers_set_has_the_papers_size():
     """12 people, 12 expressions: 288 halves, 48 of each of 132 ordered pairs: about 6,740; one of each held out."""
-    data = recorded(subjects=12, labels=("neutral", *performance.COMA))
-    found = transitions.transitions(data, "train", per_pair=transitions.PER_PAIR, reuse=None)
+    data = recorded(subjects=12, labels=("neutral", *expression_recipes.COMA))
+    found = transitions.transitions(data, "train", per_pair=transitions.TRANSITIONS_PER_PAIR, reuse=None)
     assert len(found.start) == 288 + 132 * 48 == 6624
     pairs = np.bincount(found.start * 13 + found.end, minlength=169).reshape(13, 13)
     expected = np.where(np.eye(13), 0, 48)
@@ -86,9 +86,9 @@ def test_the_papers_set_has_the_papers_size():
 
 def test_coma_labels_are_13():
     """Of a dataset with more expressions than CoMA has; numbers follow the names given, not the dataset."""
-    data = recorded(subjects=2, labels=("neutral", *performance.EXPRESSIONS[::-1]))
-    names = ("neutral", *performance.COMA)
-    found = motions.join(*transitions.all_pairs(data, "train", names=names, per_pair=1))
+    data = recorded(subjects=2, labels=("neutral", *expression_recipes.EXPRESSIONS[::-1]))
+    names = ("neutral", *expression_recipes.COMA)
+    found = motions.join(*transitions.all_pairs(data, "train", label_names=names, per_pair=1))
     assert len(found.start) == 2 * 12 * 2 + 132
     assert {*found.start.tolist()} == {*found.end.tolist()} == {*range(13)}
     first = next(one for one in data.sequences if one.label == "bareteeth" and one.subject == 1)
@@ -107,12 +107,12 @@ def test_everything_lets_everybody_meet_everybody(data):
 
 def test_balanced_rows_hold_every_pair_equally_often():
     start, end = np.array([0, 0, 0, 1, 1, 2]), np.array([1, 1, 1, 0, 0, 1])
-    rows = transitions.balanced(start, end)
+    rows = transitions.balance_pairs(start, end)
     pairs = list(zip(start[rows].tolist(), end[rows].tolist(), strict=True))
     assert {pair: pairs.count(pair) for pair in set(pairs)} == {(0, 1): 3, (1, 0): 3, (2, 1): 3}
     assert set(rows.tolist()) == set(range(6))
-    np.testing.assert_array_equal(transitions.balanced(start, end), rows)
-    assert len({transitions.balanced(start, end, seed).tobytes() for seed in range(9)}) > 1
+    np.testing.assert_array_equal(transitions.balance_pairs(start, end), rows)
+    assert len({transitions.balance_pairs(start, end, seed).tobytes() for seed in range(9)}) > 1
 
 
 def test_extrinsic_mean_is_near_the_karcher_mean(known, chart):
@@ -216,7 +216,7 @@ def test_the_authors_gan_trains(known, chart, tmp_path):
 
 
 def test_starts_are_fitted_on_the_peaks(known, chart):
-    found = transitions.fit_starts(chart, known)
+    found = transitions.fit_start_poses(chart, known)
     assert found.poses.shape == (4, 6, 4) and found.count.tolist() == [1, 6, 6, 6]
     peaks = known.take((known.start == 0) & (known.end == 2)).curves[:, -1]
     basis = np.asarray(chart.pose_basis, np.float64).reshape(4, -1)

@@ -32,7 +32,7 @@ class Walk(NamedTuple):
 
 
 def joined(data: dataset.Dataset, splits: Sequence[str], only=motions.halves) -> motions.Motions:
-    """`motions.halves` or `motions.directs` of several splits."""
+    """`motions.halves` or `motions.direct_transitions` of several splits."""
     return motions.join(*(only(data, split) for split in splits))
 
 
@@ -79,7 +79,7 @@ def again(data: dataset.Dataset, found: motions.Motions, *, take: int = 1) -> mo
         posed = rig.build(makehuman.subject(int(person), seed=spec["seed"]), level=spec["level"])
         mine = np.flatnonzero(found.subject == person)
         names = [(data.labels[found.start[k]], data.labels[found.end[k]]) for k in mine]
-        weights = [performance.direct(*pair, int(person), take=take, seed=spec["seed"]) for pair in names]
+        weights = [performance.perform_direct(*pair, int(person), take=take, seed=spec["seed"]) for pair in names]
         skin = rig.pose(posed, np.concatenate(weights))[:, data.landmark_index]
         moved = skin - data.neutral[person][data.landmark_index]
         curves[mine] = moved.reshape(len(mine), -1, *moved.shape[1:]) / found.scale[mine, None, None, None]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import _cases, _transferred
+from experiments import _datasets, _motion_transfer
 from facejax.data import dataset
 from facejax.data.synthetic import makehuman, performance, rig
 from facejax.geometry import rbf
@@ -48,8 +48,8 @@ class Face(NamedTuple):
 
 def regions_of(data: dataset.Dataset) -> dict[str, np.ndarray]:
     """Vertices of the head, of the face region, and on makehuman4d of the boundary's loops."""
-    found = {name: np.flatnonzero(mask) for name, mask in _cases.regions_of(data).items()}
-    if not _cases.is_makehuman(data):
+    found = {name: np.flatnonzero(mask) for name, mask in _datasets.regions_of(data).items()}
+    if not _datasets.is_makehuman(data):
         return found
     shape = makehuman.template()
     loops = graph.boundary_loops(shape.faces)
@@ -92,7 +92,7 @@ def remeshed(face: Face, seed: int) -> Face:
 
 def sequence(data: dataset.Dataset, form: Form) -> np.ndarray:
     """After SL21's figure 4: landmarks over a mesh at rest, the meshes that they make of it, and the true ones."""
-    shown, take = _performed(data) if _cases.is_makehuman(data) else _recorded(data)
+    shown, take = _performed(data) if _datasets.is_makehuman(data) else _recorded(data)
     face, moved = _resting(data, take.rest), take.landmarks[take.at]
     rest = np.broadcast_to(face.neutral, take.vertices.shape)
     warped = face.neutral + np.asarray(rbf.warp(weights(form, face), moved))
@@ -104,7 +104,7 @@ def sequence(data: dataset.Dataset, form: Form) -> np.ndarray:
     return render.contact_sheet(rows, row_labels=["landmarks", "warped", "true"], column_labels=labels)
 
 
-def _performed(data: dataset.Dataset) -> tuple[np.ndarray, _transferred.Take]:
+def _performed(data: dataset.Dataset) -> tuple[np.ndarray, _motion_transfer.Take]:
     """Seven frames of the first test subject's surprise, on makehuman4d; its rig makes their meshes."""
     subject, spec = int(data.subjects("test")[0]), data.index["spec"]
     person = makehuman.subject(subject, seed=spec["seed"])
@@ -112,12 +112,12 @@ def _performed(data: dataset.Dataset) -> tuple[np.ndarray, _transferred.Take]:
     onset = np.linspace(0, take.apex_start, 5).round()
     shown = np.array([*onset, (take.apex_end + take.offset) // 2, take.offset], int)
     skin = rig.pose(rig.build(person, level=spec["level"]), take.weights[shown])[:, : len(person.vertices)]
-    return shown, _transferred.of_skin(skin, person, data.landmark_index)
+    return shown, _motion_transfer.of_skin(skin, person, data.landmark_index)
 
 
-def _recorded(data: dataset.Dataset) -> tuple[np.ndarray, _transferred.Take]:
+def _recorded(data: dataset.Dataset) -> tuple[np.ndarray, _motion_transfer.Take]:
     """Up to seven frames that have meshes, of a test subject's first recording."""
-    take = _transferred.of_sequence(data, _first(data))
+    take = _motion_transfer.of_sequence(data, _first(data))
     some = np.unique(np.linspace(0, len(take.at) - 1, 7).round().astype(int))
     return take.at[some], take._replace(at=take.at[some], vertices=take.vertices[some])
 
@@ -126,7 +126,7 @@ def _first(data: dataset.Dataset) -> dataset.Sequence:
     """The first test subject's anger, or another expression of which there are meshes."""
     mine = [s for s in data.sequences if s.subject in data.subjects("test")[:1] and ">" not in s.label]
     for sequence in sorted(mine, key=lambda s: s.label != PAPERS):
-        if len(_transferred.of_sequence(data, sequence).at):
+        if len(_motion_transfer.of_sequence(data, sequence).at):
             return sequence
     raise ValueError(f"{data.path}: expected recordings of a test subject with meshes")
 
@@ -134,10 +134,10 @@ def _first(data: dataset.Dataset) -> dataset.Sequence:
 def others(data: dataset.Dataset, form: Form, odd: Face) -> np.ndarray:
     """After SL21's figure 6: the anger of one test subject on other faces, one of another connectivity."""
     sequence = _first(data)
-    take = _transferred.of_sequence(data, sequence)
+    take = _motion_transfer.of_sequence(data, sequence)
     shown = np.array([*np.linspace(0, sequence.apex_start, 5).round(), (sequence.apex_end + sequence.offset) // 2], int)
     source = take.rest[data.landmark_index]
-    people = PEOPLE if _cases.is_makehuman(data) else data.subjects("test")[-4:]
+    people = PEOPLE if _datasets.is_makehuman(data) else data.subjects("test")[-4:]
     people = [i for i in people if i < len(data.neutral)]
     rows = []
     for face in [*(_resting(data, data.neutral[i]) for i in people), odd]:
@@ -150,7 +150,7 @@ def others(data: dataset.Dataset, form: Form, odd: Face) -> np.ndarray:
 
 def heat(data: dataset.Dataset, errors: dict[str, np.ndarray], *, high: float = 2.0) -> np.ndarray:
     """Errors (N,) by name on the average face, from the front and from the side; mm."""
-    mean, faces, size = _cases.template_of(data), np.asarray(data.faces), (240, 300)
+    mean, faces, size = _datasets.template_of(data), np.asarray(data.faces), (240, 300)
     rows = [
         [
             render.image(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from experiments import _cases
+from experiments import _datasets
 from facejax import augment, metrics
 from facejax.data import dataset, motions
 from facejax.data.synthetic import makehuman4d
@@ -105,8 +105,8 @@ def data_of(config: People) -> dataset.Dataset:
 
 def names_of(data: dataset.Dataset) -> tuple[Names, ...]:
     """The pairs that are judged: OT23's 39 on makehuman4d, else all that can be made of the labels."""
-    if _cases.is_makehuman(data):
-        return makehuman4d.PAIRS
+    if _datasets.is_makehuman(data):
+        return makehuman4d.TABLE5_PAIRS
     return tuple(itertools.permutations(data.labels, 2))
 
 
@@ -138,7 +138,7 @@ def held(config: People, group: str, names: Sequence[Names]) -> Held:
     if people < FEWEST:
         raise ValueError(f"{data.path}: expected {FEWEST} or more people in the {group} split, got {people}")
     onsets = halves.take(halves.start == 0)
-    between = motions.interpolated(onsets, len(labels), per_pair=people, choice="spread", only=set(pairs), seed=1)
+    between = motions.interpolated_transitions(onsets, len(labels), per_pair=people, choice="spread", pairs=set(pairs), seed=1)
     found = motions.join(halves, *between)
     scale = float(np.mean(found.scale))
     curves = [scale * of_pair(found, pair) for pair in pairs]
@@ -158,7 +158,7 @@ def seen(config: People, pairs: Sequence[Pair], scale: float, count: int) -> lis
     data = data_of(config)
     halves = motions.halves(data, "train")
     onsets = halves.take(halves.start == 0)
-    between = motions.interpolated(onsets, len(data.labels), per_pair=count, choice="spread", only=set(pairs), seed=2)
+    between = motions.interpolated_transitions(onsets, len(data.labels), per_pair=count, choice="spread", pairs=set(pairs), seed=2)
     found = motions.join(halves, *between)
     return [scale * of_pair(found, pair)[:count] for pair in pairs]
 

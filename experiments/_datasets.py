@@ -11,7 +11,7 @@ import numpy as np
 from facejax.data import dataset
 from facejax.data.importers import registry
 from facejax.data.mesh_subset import MeshSubset, of_split
-from facejax.data.synthetic import makehuman, makehuman4d, performance
+from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d
 from facejax.io import cache
 from facejax.mesh import hierarchy, rbf_weights
 
@@ -95,7 +95,7 @@ def _with_people(data: dataset.Dataset) -> list[str]:
 def _four_folds(people: MeshSubset, split: str) -> list[Case]:
     by = "subjects" if split == "identity" else "labels"
     if by == "labels" and is_makehuman(people.data):
-        people = people.of_labels(performance.COMA)
+        people = people.of_labels(expression_recipes.COMA)
     return [Case(split, i, fit, held, by) for i, (fit, held) in enumerate(people.folds(FOLDS, by=by))]
 
 

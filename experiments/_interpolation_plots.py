@@ -8,7 +8,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from experiments import _interpolated as made_of
+from experiments import _interpolation_eval as made_of
 from facejax.data import dataset, motions
 
 matplotlib.use("Agg")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments._cases import Case, Mode
+from experiments._datasets import Case, Mode
 from facejax.evaluation import baselines, vertex_error
 from facejax.io import atomic
 from facejax.mesh import hierarchy
