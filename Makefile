@@ -3,26 +3,32 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# With the versions that were tested on the environment's Python: 3.11 has constraints.txt, 3.14 those of 3.13.
+CONSTRAINTS = $$($(BIN)/python -c "import sys; v = sys.version_info[1]; \
+  print('constraints.txt' if v == 11 else f'constraints-3.{min(v, 13)}.txt')")
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check -c "$(CONSTRAINTS)"
 
-.PHONY: help setup demo test slow faults lint browser bench geomstats clean
+.PHONY: help setup demo test slow faults lint types browser bench docs geomstats clean
 
 help:
 	@echo "make demo    set up, then animate three unseen faces into runs/demo"
 	@echo "make test    set up, then run the tests"
 	@echo "make slow    the slow tests, by hand"
 	@echo "make faults  kills, full disks, lost processes and 20,000 damaged files per reader, half an hour"
-	@echo "make browser the tests that need Chromium and Node, see README"
+	@echo "make browser the tests that need Chromium and Node, see docs/contributing.md"
 	@echo "make lint    ruff"
+	@echo "make types   pyright"
 	@echo "make bench   the benchmarks with their peers, a quarter of an hour; BENCH='--quick' and other options"
-	@echo "make clean   remove the virtual environment and the runs"
+	@echo "make docs    the documentation as a searchable site, into site/"
+	@echo "make clean   remove the virtual environment, the runs and the site"
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
-	$(PYTHON) -c "import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))" || \
-	  { echo "facejax needs Python 3.11 to 3.13; name one with: make PYTHON=python3.12 ..."; exit 2; }
+$(STAMP): pyproject.toml $(wildcard constraints*.txt)
+	$(PYTHON) -c "import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))" || \
+	  { echo "facejax needs Python 3.11 to 3.14; name one with: make PYTHON=python3.12 ..."; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[experiments,test]"
+	$(INSTALL) -e ".[experiments,test]"
 	@touch $(STAMP)
 
 demo: setup
@@ -47,9 +53,17 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+types: setup
+	$(INSTALL) -e ".[types]"
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
 bench: setup geomstats
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[bench,experiments]"
+	$(INSTALL) -e ".[bench,experiments]"
 	$(BIN)/python -m benchmarks $(BENCH)
+
+docs: setup
+	$(INSTALL) -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # It needs an older NumPy than the rest, and so an environment of its own.
 geomstats: .venv-geomstats/.installed
@@ -60,4 +74,4 @@ geomstats: .venv-geomstats/.installed
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-geomstats runs
+	rm -rf $(VENV) .venv-geomstats runs site

@@ -1,11 +1,12 @@
-"""All benchmarks, each in a process of its own; and what got slower since the committed baseline.
+"""Run all benchmarks, each in a process of its own, or compare them with the committed baseline.
 
     python -m benchmarks [--quick] [--only NAME ...] [--runs N] [--publish] [--out FOLDER]
     python -m benchmarks compare [FILE.json ...] [--quick] [--only NAME ...]
 
 The first writes FOLDER/NAME.json, table.md and sizes.png; with --publish also benchmarks/results and the baseline,
-whose tolerances come of --runs runs. The second runs them anew, or takes the files, and ends with exit code 1
-where a ratio to a peer has fallen by more than its tolerance. Both want a quiet machine.
+whose tolerances are estimated from --runs runs. The second runs the benchmarks, or reads the given result files, and
+ends with exit code 1 where a ratio to a peer has fallen by more than its tolerance. Both need an otherwise idle
+machine.
 """
 
 from __future__ import annotations
@@ -30,39 +31,40 @@ NAMES = ("srvf", "augment", "motion", "lstm", "decoder", "rbf", "linear", "pipel
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What to run."""
+    """Options of a run."""
 
     quick: bool = False
-    """Fewer repeats, and no costs against size."""
+    """Use fewer repeats, and measure no cost against size."""
     only: tuple[str, ...] = ()
-    """Some of them, by name."""
+    """Names of the benchmarks to run; by default all."""
     runs: int = 1
-    """One after another, quick ones but the last, whose figures are shown; all count for the baseline's tolerances."""
+    """Number of runs, all but the last with --quick; the last is shown, all count for the baseline's tolerances."""
     publish: bool = False
-    """Write benchmarks/results and benchmarks/baseline.json too."""
+    """Also write benchmarks/results and benchmarks/baseline.json."""
     name: str = "cpu"
-    """Of the published files; only `cpu` is the baseline."""
+    """Name of the published files; only `cpu` becomes the baseline."""
     out: Path = Path("runs/benchmarks")
-    """Folder for the figures."""
+    """Folder for the results."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Compare:
-    """What to compare with the baseline."""
+    """Options of a comparison with the baseline."""
 
     given: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Files that benchmarks wrote; without them they are run."""
+    """Result files of benchmarks; by default the benchmarks are run."""
     quick: bool = False
-    """Fewer repeats."""
+    """Use fewer repeats."""
     only: tuple[str, ...] = ()
-    """Some of them, by name."""
+    """Names of the benchmarks to run; by default all."""
     baseline: Path = _compare.BASELINE
+    """Baseline file."""
     out: Path = Path("runs/benchmarks")
-    """Folder for the figures of a run."""
+    """Folder for the results of a run."""
 
 
 def main(arguments: list[str]) -> int:
-    """The exit code."""
+    """Run the command line and return the exit code."""
     comparing = arguments[:1] == ["compare"]
     kind, rest = (Compare, arguments[1:]) if comparing else (Config, arguments)
     config = tyro.cli(kind, prog="python -m benchmarks" + " compare" * comparing, description=__doc__, args=rest)
@@ -74,10 +76,10 @@ def main(arguments: list[str]) -> int:
 
 
 def everything(config: Config) -> int:
-    """Run, and write what was found."""
+    """Run the benchmarks and write their results; return the exit code."""
     names = _chosen(config.only)
     if config.publish and (config.quick or config.only):
-        raise ValueError("--publish writes what the README quotes: leave out --quick and --only")
+        raise ValueError("--publish needs a full run: leave out --quick and --only")
     if config.runs < 1 or (config.publish and config.runs < 2):
         raise ValueError(f"--runs: expected 1 or more, with --publish 2 or more, got {config.runs}")
     _writable(config.out)
@@ -91,10 +93,10 @@ def everything(config: Config) -> int:
 
 
 def compare(config: Compare) -> int:
-    """1 where something got slower than its own ratio."""
+    """Compare with the baseline; return 1 where a ratio has fallen by more than its tolerance."""
     known = _compare.read(config.baseline)
     if config.given and (config.only or config.quick):
-        raise ValueError("--only and --quick go with a run, not with files")
+        raise ValueError("--only and --quick apply to a run, not to result files")
     if config.given:
         rows = _compare.rows_of(config.given)
     else:
@@ -107,7 +109,7 @@ def compare(config: Compare) -> int:
 
 
 def _writable(folder: Path) -> None:
-    """Make it, or say before anything is measured that it cannot be written."""
+    """Create the output folder. Raises `ValueError` where it is not writable, before anything is measured."""
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise ValueError(f"--out {folder}: not writable")
@@ -120,20 +122,20 @@ def _chosen(only: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _run(names: tuple[str, ...], out: Path, quick: bool) -> list[dict[str, Any]]:
-    """Each in a process of its own, so that memory and caches are its own too."""
+    """Run each benchmark in a process of its own, so that memory and caches are separate."""
     found = []
     for name in names:
         path = out / f"{name}.json"
         command = [sys.executable, "-m", f"benchmarks.{name}", "--json", str(path.absolute())] + ["--quick"] * quick
         print(f"benchmarks.{name}", file=sys.stderr, flush=True)
         if code := subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL).returncode:
-            raise RuntimeError(f"benchmarks.{name} ended with exit code {code}; what it says stands above")
+            raise RuntimeError(f"benchmarks.{name} ended with exit code {code}; see its message above")
         found.append(json.loads(path.read_text()))
     return found
 
 
 def _written(documents: list[dict[str, Any]], out: Path) -> tuple[str, list[dict]]:
-    """The table and, where there are sizes, their plot."""
+    """Write the table and, where there are any, the plot of cost against size."""
     rows = [row for document in documents for row in document["rows"]]
     sizes = [row for document in documents for row in document["sizes"]]
     table = _measure.table(rows)

@@ -1,10 +1,10 @@
-"""S2D-Dec in PyTorch from the same weights, in three ways: `benchmarks.decoder` times them beside ours.
+"""S2D-Dec in PyTorch from the same weights, in three implementations: peers of `benchmarks.decoder`.
 
-* `rows`: as published code has it: lift every sample (B, V, C) by its three corners, gather whole spirals
+* `rows`: as in published code: upsample every sample (B, V, C) by its three corners, gather whole spirals
   (B, V, S * C), multiply.
-* `sparse`: the batch inside, as ours has it, lifted by a sparse product.
-* `sums`: our own way: multiply first, then one weighted sum of gathered rows by `embedding_bag`. No published code
-  does that; it tells how much of the ratio is the way, and how much the library.
+* `sparse`: batch axis inside, as in facejax, upsampled by a sparse product.
+* `sums`: facejax's algorithm: multiply first, then one weighted sum of gathered rows by `embedding_bag`. No published
+  code does so; it separates the effect of the algorithm from that of the library.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Tensors = Any
 
 
 class Peer:
-    """Weights, tables and optimiser. Displacements are taken as they are: the scale of the parameters is the unit."""
+    """Weights, tables and optimiser. Displacements are not standardised: the parameters' scale is one."""
 
     def __init__(self, params: s2d_dec.S2DDec, hierarchy: Hierarchy, *, rate: float, weight_decay: float):
         self.weights = jax.tree.map(tensor, params.weights)
@@ -43,7 +43,7 @@ class Peer:
         self.bags = [_bag(stencil) for stencil in (*hierarchy.climbs[::-1], hierarchy.surface)]
 
     def forward(self, way: str) -> Callable[[Tensors], Tensors]:
-        """A function from landmarks (B, L, 3) to vertices (B, N, 3)."""
+        """Return a function from landmarks (B, L, 3) to vertices (B, N, 3)."""
         return {"rows": self._rows, "sparse": self._sparse, "sums": self._sums}[way]
 
     def inference(self, forward: Callable, marks: Tensors) -> Callable[[], Tensors]:
@@ -54,11 +54,11 @@ class Peer:
         return call
 
     def slopes(self, forward: Callable, marks: Tensors, target: Tensors) -> Callable[[], list[Tensors]]:
-        """The gradient of the mean absolute error."""
+        """Return a function that computes the gradient of the mean absolute error."""
         return lambda: list(torch.autograd.grad((forward(marks) - target).abs().mean(), self.trained))
 
     def step(self, forward: Callable, marks: Tensors, target: Tensors, weights: Tensors) -> Callable[[], Tensors]:
-        """A training step of `losses.s2d`, reduced as the paper does; the loss before it."""
+        """Return a training step on `losses.s2d`, reduced as in the paper; it returns the loss before the step."""
 
         def call() -> Tensors:
             self.optimiser.zero_grad()
@@ -121,19 +121,19 @@ def _bag_conv(x: Tensors, bag: tuple[Tensors, Tensors], conv: dict[str, Tensors]
 
 
 def _bag(stencil) -> tuple[Tensors, Tensors]:
-    """All reads of each vertex among the products (S * M, .), and their weights: (V, S * K)."""
+    """Return the indices into the products (S * M, .) of each vertex, and their weights: (V, S * K)."""
     positions, _, vertices = stencil.source.shape
     index = stencil.source + stencil.back.shape[2] * np.arange(positions)[:, None, None]
-    # On a GPU embedding_bag wants bags of one dimension's length in memory order too.
+    # On a GPU embedding_bag needs contiguous bags.
     return tuple(tensor(np.ascontiguousarray(x.reshape(-1, vertices).T)) for x in (index, stencil.weight))
 
 
 def _sparse(hierarchy: Hierarchy, level: int) -> Tensors:
-    """The lift from level + 1 as a sparse matrix."""
+    """Return the upsampling from level + 1 as a sparse matrix."""
     corners, weights = hierarchy.corners[level], hierarchy.weights[level]
     starts = torch.arange(0, corners.size + 1, corners.shape[1])
     size = (len(corners), hierarchy.sizes[level + 1])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns that sparse matrices of rows are in beta
+        warnings.simplefilter("ignore")  # it warns that sparse CSR tensors are in beta
         matrix = torch.sparse_csr_tensor(starts, tensor(corners).cpu().flatten(), tensor(weights).cpu().flatten(), size)
     return matrix.to(device())

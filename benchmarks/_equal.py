@@ -1,4 +1,4 @@
-"""A fast wrong answer is no answer: what is compared is checked to be equal first."""
+"""Checks that all timed implementations give equal results."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 
 def check(ours: Any, theirs: Any, *, tolerance: float = 1e-4) -> None:
-    """Every array of two trees, PyTorch's tensors among them, equal to a part of its largest entry."""
+    """Assert that two pytrees of arrays or PyTorch tensors agree, relative to the largest entry of each array."""
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         a, b = host(a), host(b)
         np.testing.assert_allclose(b, a, rtol=0, atol=tolerance * np.abs(a).max())
 
 
 def host(array: Any) -> np.ndarray:
-    """As NumPy has it, wherever it lies."""
+    """Return an array or a tensor on any device as a NumPy array."""
     return np.asarray(array.detach().cpu() if hasattr(array, "detach") else array)

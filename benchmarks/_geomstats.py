@@ -1,11 +1,11 @@
-"""The square-root velocity transform and geodesics by geomstats, in an interpreter of its own.
+"""Square-root velocity transform and geodesics by geomstats, in a separate Python environment.
 
     PYTHON benchmarks/_geomstats.py FOLDER
 
-geomstats 2.8 needs a NumPy below 2.4, so that it lives in another virtual environment than JAX. `benchmarks.srvf`
+geomstats 2.8 needs NumPy below 2.4, so it is installed in another virtual environment than JAX. `benchmarks.srvf`
 starts this file with that environment's Python; it imports nothing of facejax. FOLDER/curves.npy holds motions (K, T,
-D). For every line `TASK` on standard input it does the task and prints `done`; `save TASK` writes the result to
-FOLDER/TASK.npy as well. All works on whole arrays, as geomstats does.
+D). For every line `TASK` on standard input it runs the task and prints `done`; `save TASK` also writes the result to
+FOLDER/TASK.npy. All tasks work on whole arrays, as geomstats does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 
 def tasks(curves: np.ndarray) -> dict:
-    """Functions of nothing; motions start at the origin, as geomstats wants them, and their first frame is left out."""
+    """Return the tasks as functions; as geomstats expects, motions start at the origin, which is omitted."""
     from geomstats.geometry.discrete_curves import SRVTransform
     from geomstats.geometry.euclidean import Euclidean
     from geomstats.geometry.hypersphere import Hypersphere
@@ -28,7 +28,7 @@ def tasks(curves: np.ndarray) -> dict:
     frames, numbers = curves.shape[1:]
     transform = SRVTransform(Euclidean(numbers), frames)
     moved = (curves - curves[:, :1])[:, 1:]
-    # A curve of unit length has q of unit mean square: a point on the sphere of all its numbers.
+    # A curve of unit length has q of unit mean square: a point on the unit sphere of all coordinates.
     lengths = np.linalg.norm(np.diff(curves, axis=1), axis=2).sum(axis=1)[:, None, None]
     points = (transform(moved / lengths) / np.sqrt(frames - 1)).reshape(len(curves), -1)
     sphere = Hypersphere(dim=points.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""The rows that the README quotes, in words, beside what was aimed at and each peer's ratio."""
+"""Table of the benchmark rows that the README quotes, with targets and the ratio to each peer."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from benchmarks._measure import Row, seconds
 
 
 class Work(NamedTuple):
-    """One line."""
+    """One line of the table."""
 
     name: str
     words: str
     aim: str
-    peers: tuple[str, ...] = ()  # sides by the beginning of their names; of each, the fastest
+    peers: tuple[str, ...] = ()  # prefixes of the names of peers; the fastest of each is shown
 
 
 WORKS = (
@@ -49,7 +49,7 @@ WORKS = (
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Those that were measured, as Markdown."""
+    """Return the Markdown table of the lines that were measured."""
     known = {row["name"]: row for row in rows}
     lines = ["| work | aim | facejax | peers |", "|" + " --- |" * 4]
     for work in WORKS:

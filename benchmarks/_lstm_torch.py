@@ -1,7 +1,7 @@
-"""One expression network in PyTorch, eager: `benchmarks.lstm` times it beside ours.
+"""An expression network in eager PyTorch: the peer of `benchmarks.lstm`.
 
-torch.compile 2.13 does not look into `nn.LSTM` (a graph break leaves it as it is, and only the loss would be compiled),
-and with its experimental `allow_rnn` the compiled program fails.
+torch.compile 2.13 does not compile `nn.LSTM` (a graph break leaves it eager, and only the loss would be compiled), and
+with its experimental `allow_rnn` the compiled program fails.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import torch
 from benchmarks._torch import device, tensor
 from facejax.models import lstm
 
-RATE = 1e-3  # of Adam
+RATE = 1e-3  # learning rate of Adam
 Tensors = Any
 
 
 class Peer:
     """The same network, loss and optimiser, from the same weights; a batch is (x, target, mask), time first.
 
-    `nn.LSTM` has two biases and adds them. The second stays zero here: trained, it would double the bias's rate.
+    `nn.LSTM` has two biases and adds them. The second stays zero: training both would double the bias's learning rate.
     """
 
     def __init__(self, weights: lstm.Weights):
@@ -35,7 +35,7 @@ class Peer:
         values = [row[name] for row in rows for name in ("input", "hidden", "bias")] + [dense["kernel"], dense["bias"]]
         with torch.no_grad():
             for place, value in zip(places, values, strict=True):
-                place.copy_(tensor(np.asarray(value).T))  # the gates' order is the same: i, f, g, o
+                place.copy_(tensor(np.asarray(value).T))  # same order of gates: i, f, g, o
             for i in range(len(rows)):
                 getattr(self.lstm, f"bias_hh_l{i}").zero_().requires_grad_(False)
         self.trained = places
@@ -52,7 +52,7 @@ class Peer:
         return lambda: torch.autograd.grad(self._loss(batch), self.trained)
 
     def step(self, batch: Tensors) -> Callable[[], Tensors]:
-        """The loss before the step."""
+        """Return a training step; it returns the loss before the step."""
 
         def call() -> Tensors:
             self.optimiser.zero_grad()
@@ -70,7 +70,7 @@ class Peer:
 
 
 def as_weights(found: Tensors) -> lstm.Weights:
-    """Tensors in the order of `trained` as a tree like ours."""
+    """Return tensors in the order of `trained` as a pytree like facejax's weights."""
     *rows, kernel, bias = [array.cpu().numpy().T for array in found]
     layers = [dict(zip(("input", "hidden", "bias"), rows[i : i + 3], strict=True)) for i in range(0, len(rows), 3)]
     return {"layers": layers, "dense": {"kernel": kernel, "bias": bias}}

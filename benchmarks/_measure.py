@@ -1,14 +1,15 @@
-"""How benchmarks measure: functions in turns, in one process, their first call apart from the steady time after it.
+"""Rows, command line and result files of the benchmarks.
 
-Machines are noisy and drift: what is to be compared runs in turns, and the ratio of medians is the headline. A row is
+Implementations that are compared run in turns in one process, since machines are noisy and drift; first calls are timed
+separately, and the ratio of medians is reported. A row is
 
-    {"name", "first_s", "min_s", "median_s", "per_s", "unit",   of our own way; first_s holds compilation
-     "peer", "peer_median_s", "ratio",                          the fastest of the peers, and how much slower it is
+    {"name", "first_s", "min_s", "median_s", "per_s", "unit",   of facejax; first_s includes compilation
+     "peer", "peer_median_s", "ratio",                          the fastest peer, and its time over ours
      "gflop", "roofline_share",                                 see `benchmarks._roofline`
-     "sides": {name: {"first_s", "min_s", "median_s"}}}         everybody
+     "sides": {name: {"first_s", "min_s", "median_s"}}}         of all implementations
 
-with None where there is no peer, or no count of operations. `calls` says how many times a side does the work in one
-call, where it is timed scanned.
+with None where there is no peer or no count of operations. `calls` gives the number of repetitions of the work in one
+call, for implementations that scan over it.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from facejax.io import atomic
 
 OURS = "facejax"
 Row = dict[str, Any]
-Found = tuple[list[Row], list[Row]]  # works, and costs against size
+Found = tuple[list[Row], list[Row]]  # rows, and rows of cost against size
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What every benchmark understands."""
+    """Options of every benchmark."""
 
     json: Path | None = None
-    """Also write the rows here."""
+    """JSON file to write the results to."""
     quick: bool = False
-    """Fewer repeats, and no costs against size."""
+    """Use fewer repeats, and measure no cost against size."""
 
 
 Chosen = TypeVar("Chosen", bound=Options)
@@ -60,8 +61,8 @@ def row(
     gbyte: float | None = None,
     **about: Any,
 ) -> Row:
-    """Time functions in turns, of which one is ours; a call makes so many items at so many operations and bytes."""
-    jax.clear_caches()  # the first call compiles again what was compiled for the checks
+    """Time implementations in turns and return the row; `items`, `gflop` and `gbyte` are per repetition of the work."""
+    jax.clear_caches()  # so that the first call includes compilation
     found = _timing.interleaved(functions, repeats=repeats)
     for side, count in (calls or {}).items():
         found[side] |= {key: found[side][key] / count for key in ("min_s", "median_s")}
@@ -71,33 +72,36 @@ def row(
     made |= {"peer": peer, "peer_median_s": median, "ratio": median / ours["median_s"] if peer else None}
     share = _roofline.share(ours["median_s"], gflop=gflop, gbyte=gbyte)
     made |= {"gflop": gflop, "roofline_share": share, **about, "sides": found}
-    print(_told(made), file=sys.stderr, flush=True)
+    print(_summary(made), file=sys.stderr, flush=True)
     return made
 
 
 def lone(name: str, times: Mapping[str, float], *, items: int = 1, unit: str = "", **about: Any) -> Row:
-    """A row of what was timed elsewhere, with no peer."""
+    """Return a row from times measured elsewhere, without a peer."""
     made = {"name": name, **times, "per_s": items / times["median_s"], "unit": unit}
     made |= dict.fromkeys(("peer", "peer_median_s", "ratio", "gflop", "roofline_share"))
     made |= {**about, "sides": {OURS: dict(times)}}
-    print(_told(made), file=sys.stderr, flush=True)
+    print(_summary(made), file=sys.stderr, flush=True)
     return made
 
 
 def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -> None:
-    """Parse the command line, measure, print the tables, write the file. Bad input: one line, exit code 2."""
+    """Parse the command line, run the benchmark, print the tables and write the JSON file.
+
+    Invalid input ends with a one-line message on standard error and exit code 2.
+    """
     description = sys.modules[run.__module__].__doc__
     config = tyro.cli(config_type, prog=f"python -m benchmarks.{name}", description=description)
     if config.json is not None and (problem := _unwritable(config.json)):
         print(f"benchmarks.{name}: --json {config.json}: {problem}", file=sys.stderr)
         raise SystemExit(2)
-    runtime.keep_memory()  # for the peers in this process too
+    runtime.keep_memory()  # applies to the peers in this process as well
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     begun = time.perf_counter()
     try:
         rows, sizes = run(config)
     except (ValueError, RuntimeError, OSError, AssertionError, IndexError, ZeroDivisionError) as error:
-        said = f"ours and a peer's differ: {error}" if isinstance(error, AssertionError) else str(error)
+        said = f"the results of facejax and a peer differ: {error}" if isinstance(error, AssertionError) else str(error)
         print(f"benchmarks.{name}: {atomic.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None
     print(table(rows))
@@ -109,7 +113,7 @@ def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -
 
 
 def _unwritable(path: Path) -> str | None:
-    """Why a file cannot be written, asked before minutes are spent on it."""
+    """Return why a file cannot be written, or None; checked before anything is measured."""
     if path.is_dir():
         return "is a folder"
     try:
@@ -120,13 +124,13 @@ def _unwritable(path: Path) -> str | None:
 
 
 def write(path: Path, document: Any) -> None:
-    """A JSON file, whole or not at all."""
+    """Write a JSON file atomically."""
     with atomic.replace_file(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Rows as Markdown."""
+    """Return rows as a Markdown table."""
     lines = ["| work | median | min | first call | rate | fastest peer | ratio | of the roofline |", "|" + " --- |" * 8]
     for made in rows:
         peer = f"{made['peer']}: {seconds(made['peer_median_s'])}" if made["peer"] else ""
@@ -140,13 +144,13 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def seconds(value: float) -> str:
-    """A time to three digits, in the unit that suits it."""
+    """Format a time with three significant digits in s, ms or us."""
     for unit, size in (("s", 1.0), ("ms", 1e-3)):
         if value >= size:
             return f"{value / size:.3g} {unit}"
     return f"{value * 1e6:.3g} us"
 
 
-def _told(made: Row) -> str:
+def _summary(made: Row) -> str:
     sides = (f"{side} {seconds(times['median_s'])}" for side, times in made["sides"].items())
     return f"{made['name']}: {', '.join(sides)}"

@@ -1,8 +1,8 @@
-"""The training steps of the GAN and of the flow in PyTorch, eager: `benchmarks.motion` times them beside ours.
+"""Training steps of the GAN and the flow in eager PyTorch: peers of `benchmarks.motion`.
 
-Same weights, chart, data, losses, optimisers with their schedules, and moving averages, on whole batches. `check` runs
-both sides on the same draws first; a timed step draws for itself, as ours does. What a critic step needs three times
-is looked up once, and gradients are asked for the weights alone that move.
+Same weights, tangent PCA, data, losses, optimisers with their schedules, and moving averages, on whole batches.
+`check` runs both sides on the same random draws first; a timed step draws for itself, as facejax does. Values that a
+critic step needs three times are computed once, and gradients are taken with respect to the trained weights only.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Tensors = Any
 
 
 class Peer:
-    """What both trainings share: data and chart as tensors, the optimisers' rates, the moving average."""
+    """Common parts of both trainings: data and tangent PCA as tensors, optimisers, moving average."""
 
     def __init__(self, state: loop.TrainState, held: Any, plan: GanPlan | FlowPlan):
         (values, conditions), chart = held
@@ -38,7 +38,7 @@ class Peer:
             weight.requires_grad_()
 
     def held(self) -> list[torch.Tensor]:
-        """All that lasts from step to step; slopes do not, a step makes them anew."""
+        """Return all tensors that persist from step to step; gradients do not."""
         moments = [moment for adam in self.adams for state in adam.state.values() for moment in state.values()]
         return [*self.data, *jax.tree.leaves((tuple(self.chart), self.average, self.weights)), *moments]
 
@@ -62,14 +62,14 @@ class Gan(Peer):
         self.adams = [torch.optim.Adam(jax.tree.leaves(side), betas=(0.5, 0.9), fused=True) for side in self.weights]
 
     def draws(self, state: loop.TrainState, size: int) -> list[jax.Array]:
-        """What our step draws from its key."""
+        """Return the random draws of facejax's step."""
         count, width = self.plan.critic_steps, len(self.generator["skip"])
         noise, chord, play = jax.random.split(jax.random.fold_in(state.key, state.step), 3)
         chords = [jax.random.uniform(key, (size // count,)) for key in jax.random.split(chord, count)]
         return [_normals(noise, size, width), jnp.stack(chords), _normals(play, size // count, width)]
 
     def step(self, rows, draws=None) -> dict[str, torch.Tensor]:
-        """One round of the game; the metrics of ours."""
+        """Run one step, four of the critic and one of the generator; return the same metrics as facejax."""
         plan, width, each = self.plan, len(self.generator["skip"]), len(rows) // self.plan.critic_steps
         if draws is None:
             draws = torch.randn(len(rows), width), torch.rand(plan.critic_steps, each), torch.randn(each, width)
@@ -88,7 +88,7 @@ class Gan(Peer):
             rate = self._rate(self.done * plan.critic_steps + i, plan.critic_steps)
             _descend(self.adams[1], plan.penalty * penalty - distance, rate)
             found.append(torch.stack([distance, penalty]).detach())
-        # `here` and the rest are the last batch's: the generator sees those.
+        # `here` and the others are of the last batch, which the generator uses.
         fake = self._generate(play, *here, expected)
         loss = -self._score(fake, self._known(*here), expected).mean()
         _descend(self.adams[0], loss, self._rate(self.done, 1))
@@ -101,15 +101,15 @@ class Gan(Peer):
 
     def _generate(self, noise, start, end, pose, expected):
         weights = self.generator
-        hidden = torch.cat([noise, *_told(weights, start, end, pose)], 1)
+        hidden = torch.cat([noise, *_conditions(weights, start, end, pose)], 1)
         deviation = noise @ weights["skip"] + _linear(weights["head"], _stack(weights, hidden, F.silu))
         unit = F.pad(self.chart.scale[start, end], (tangent_pca.SCALARS, 0), value=1.0)
         return expected + unit * deviation
 
     def _known(self, start, end, pose):
-        """What the critic is told about a batch, and the factor of its coordinates."""
+        """Return the critic's condition of a batch, and the factor of its coordinates."""
         factor = self.chart.scale[start, end].square().mean(1, keepdim=True).rsqrt()
-        return torch.cat(_told(self.critic, start, end, pose), 1), factor
+        return torch.cat(_conditions(self.critic, start, end, pose), 1), factor
 
     def _score(self, values, known, expected):
         told, factor = known
@@ -128,12 +128,12 @@ class Flow(Peer):
         self.adams = [torch.optim.AdamW(weights, weight_decay=plan.weight_decay, fused=True)]
 
     def draws(self, state: loop.TrainState, size: int) -> list[jax.Array]:
-        """What our step draws from its key."""
+        """Return the random draws of facejax's step."""
         source, time = jax.random.split(jax.random.fold_in(state.key, state.step))
         return [_normals(source, size, self.data[0].shape[1]), jax.random.uniform(time, (size,))]
 
     def step(self, rows, draws=None) -> dict[str, torch.Tensor]:
-        """One step; the metrics of ours."""
+        """Run one step; return the same metrics as facejax."""
         if draws is None:
             draws = torch.randn(len(rows), self.data[0].shape[1]), torch.rand(len(rows))
         noise, time = draws
@@ -151,7 +151,7 @@ class Flow(Peer):
             scale /= math.sqrt(len(self.chart.p))
             unit = torch.cat([scale.square().mean(1, keepdim=True).sqrt(), scale], 1)
             size = unit.pow(2 - 2 * self.plan.whitening).mean(1, keepdim=True).sqrt()
-        found, found_rate = self._velocity(y, s, time, _told(self.weights, start, end, pose), centre, unit)
+        found, found_rate = self._velocity(y, s, time, _conditions(self.weights, start, end, pose), centre, unit)
         off = (found - wanted) / (size * unit.pow(self.plan.whitening))
         loss = torch.cat([off, found_rate - rate], 1).square().mean()
         _descend(self.adams[0], loss, self.plan.rate * _cosine(self.done, self.plan.steps))
@@ -179,7 +179,7 @@ class Flow(Peer):
 
 
 def check(peer: Peer, advance: Callable, start: loop.TrainState, rows: np.ndarray, held: Any) -> None:
-    """A peer that does something else is none: three steps' metrics, and where weights and averages have gone."""
+    """Assert that three steps of the peer give the same metrics, weights and moving averages as facejax."""
     state = jax.tree.map(jnp.copy, start)  # what is donated is the copy
     for step in range(3):
         draws = map(tensor, peer.draws(state, len(rows)))
@@ -187,11 +187,11 @@ def check(peer: Peer, advance: Callable, start: loop.TrainState, rows: np.ndarra
         found = peer.step(tensor(rows), draws)
         assert found.keys() == expected.keys(), (sorted(found), sorted(expected))
         for name, value in expected.items():
-            # The first step has the same weights. Adam's rounding then parts them: means of scores of the order of 1
-            # may cancel, and the third step's were up to 0.0012 apart in four sets of data.
+            # The weights of the first step are equal. Later they differ by rounding in Adam: means of scores of order
+            # 1 may cancel, and those of the third step differed by up to 0.0012 on four datasets.
             apart = 3e-3 if step else 1e-5
             np.testing.assert_allclose(found[name].item(), value, rtol=1e-3, atol=apart, err_msg=name)
-    # Adam's first steps are of one size however small a slope: where that is rounding alone, the sides may part.
+    # Adam's first steps have the same size for any gradient: where it is rounding error, the sides differ.
     for ways in ((state.params, start.params, peer.weights), (state.extra, start.extra, peer.average)):
         ours, before, theirs = map(_flat, ways)
         apart, gone = np.linalg.norm(theirs - ours), np.linalg.norm(ours - before)
@@ -219,7 +219,7 @@ def _descend(optimiser: torch.optim.Optimizer, loss: torch.Tensor, rate: float) 
     optimiser.zero_grad()
 
 
-def _told(weights: Tensors, start, end, pose) -> list[torch.Tensor]:
+def _conditions(weights: Tensors, start, end, pose) -> list[torch.Tensor]:
     return [weights["labels"][0, start], weights["labels"][1, end], pose]
 
 

@@ -1,8 +1,8 @@
-"""The machine's limits, measured in the same process: the fastest product of two matrices, and memory's bandwidth.
+"""Roofline of the machine, measured in the same process: fastest matrix product, and memory bandwidth.
 
-What takes `gflop` billions of operations and must move `gbyte` billions of bytes takes at least the longer of the two
-times; that, by its own time, is its share of the roofline. Operations are those of the work as its source states it:
-who finds a way with fewer may pass 100 %.
+Work of `gflop` billions of operations that moves `gbyte` billions of bytes takes at least the longer of the two times.
+That time over the measured one is its share of the roofline. Operations are counted for the work as its source states
+it; an implementation with fewer operations may exceed 100 %.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 
 SQUARE = 1024
-ENTRIES = 1 << 25  # 128 MB of float32: no cache holds them
+ENTRIES = 1 << 25  # 128 MB of float32, larger than any cache
 
 
 class Roofline(NamedTuple):
+    """Limits of the machine."""
+
     gflop_per_s: float
     gbyte_per_s: float
 
 
 @functools.cache
 def measured() -> Roofline:
-    """The best of several tries; PyTorch's product counts where it is installed."""
+    """Measure the limits: the best of several tries, with JAX and, where installed, PyTorch."""
     a = np.random.default_rng(0).normal(size=(SQUARE, SQUARE)).astype(np.float32)
     ours, product = jnp.asarray(a), jax.jit(functools.partial(jnp.matmul, precision="highest"))
     ways = [lambda: product(ours, ours)]
@@ -36,7 +38,7 @@ def measured() -> Roofline:
     except ImportError:
         pass
     else:
-        if jax.default_backend() == "cpu":  # on a GPU it would return before it is done
+        if jax.default_backend() == "cpu":  # on a GPU the call returns before the product is done
             theirs = torch.tensor(a)
             ways.append(lambda: theirs @ theirs)
     fastest = min(_fastest(way, 20) for way in ways)
@@ -52,7 +54,7 @@ def measured() -> Roofline:
 
 
 def share(seconds: float, *, gflop: float | None, gbyte: float | None) -> float | None:
-    """Of the roofline; None without a count."""
+    """Return the share of the roofline; None without a count of operations or bytes."""
     if gflop is None and gbyte is None:
         return None
     limits = measured()

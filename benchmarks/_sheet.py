@@ -1,4 +1,4 @@
-"""A made-up mesh of any size."""
+"""Synthetic test mesh of any size."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """A bent square sheet of side^2 vertices."""
+    """Return vertices (side^2, 3) and triangles of a curved square grid."""
     y, x = np.divmod(np.arange(side * side), side)
     vertices = np.stack([x, y, 5 * np.sin(x / 9) * np.cos(y / 7)], axis=1)
     i = np.arange(side * side).reshape(side, side)

@@ -1,4 +1,4 @@
-"""Cost against size: one work at several sizes along an axis, and the exponent of the power that its cost follows."""
+"""Cost against size: times of one task at several sizes along an axis, and the exponent of their power law."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Row = dict[str, Any]
 def along(
     name: str, axis: str, sizes: Iterable[int], make: Callable[[int], Callable[[], Any]], *, repeats: int = 7
 ) -> list[Row]:
-    """A row for each size: the work that `make(size)` returns, first call and steady."""
+    """Time the function that `make(size)` returns for each size; one row per size."""
     rows = []
     for size in sizes:
         (times,) = _timing.interleaved({name: make(size)}, repeats=repeats).values()
@@ -28,15 +28,15 @@ def along(
 
 
 def exponent(rows: Sequence[Row]) -> float:
-    """Of the power of size that all but the smallest sizes follow, where constant costs no longer weigh."""
-    # Of five sizes the largest four, of four or three all but one or none.
+    """Fit the exponent of cost over size, without the smallest sizes, where constant costs dominate."""
+    # The largest four of five sizes, three of four, all of three or fewer.
     upper = sorted(rows, key=lambda row: row["size"])[len(rows) // 2 - 1 :]
     size, cost = (np.log([row[key] for row in upper]) for key in ("size", "median_s"))
     return float(np.polyfit(size, cost, 1)[0])
 
 
 def curves(rows: Iterable[Row]) -> dict[tuple[str, str], list[Row]]:
-    """Rows by (axis, name), in the order of their first."""
+    """Group rows by (axis, name), in order of appearance."""
     found: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         found.setdefault((row["axis"], row["name"]), []).append(row)
@@ -44,7 +44,7 @@ def curves(rows: Iterable[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def table(rows: Iterable[Row]) -> str:
-    """Each curve's least and largest size, and its exponent, as Markdown."""
+    """Return a Markdown table of the smallest and largest size and the exponent of each curve."""
     lines = ["| work | axis | from | to | cost grows as |", "|" + " --- |" * 5]
     for (axis, name), curve in curves(rows).items():
         ends = (f"{row['size']:,}: {1e3 * row['median_s']:.3g} ms" for row in (curve[0], curve[-1]))
@@ -53,7 +53,7 @@ def table(rows: Iterable[Row]) -> str:
 
 
 def plot(rows: Iterable[Row], path: Path) -> None:
-    """A panel for each axis, both scales logarithmic."""
+    """Plot cost against size on logarithmic scales, one panel per axis."""
     import matplotlib
 
     matplotlib.use("Agg")

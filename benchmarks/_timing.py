@@ -1,6 +1,6 @@
-"""Functions in turns: their first call apart, the least and the median of the others.
+"""Interleaved timing of functions: first call, minimum and median.
 
-Work shorter than a turn is repeated within it and counts with its mean, as `timeit` has it.
+Work shorter than a turn is repeated within it and counts with its mean, as in `timeit`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 
 import jax
 
-REST = 0.03  # seconds of which the process must have spent next to nothing before the next turn
-PATIENCE = 1.0  # seconds after which a turn begins anyway
-# Seconds. Shorter work is repeated for so long, after as long untimed, since rested cores are slow at first.
+REST = 0.03  # seconds in which the process must be idle before the next turn
+PATIENCE = 1.0  # seconds after which a turn starts anyway
+# Seconds. Shorter work is repeated for this time, after a warm-up of the same length: idle cores are slow at first.
 TURN = 0.03
 
 
 def interleaved(functions: Mapping[str, Callable[[], Any]], *, repeats: int = 20) -> dict[str, dict[str, float]]:
-    """First-call, minimum and median seconds of each function; results are waited for."""
+    """Return first-call, minimum and median seconds of each function, including the wait for its results."""
     first = {name: _seconds(function) for name, function in functions.items()}
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repeats):
@@ -33,10 +33,10 @@ def interleaved(functions: Mapping[str, Callable[[], Any]], *, repeats: int = 20
 
 
 def settle() -> None:
-    """Wait until the threads of whoever was last have come to rest.
+    """Wait until the threads of the previous function are idle.
 
-    OpenBLAS's and OpenMP's go on spinning for 0.1 s and more after their work, and take a core from whoever is next:
-    right after SciPy an RBF warp took 10 ms, a second later 5.
+    Threads of OpenBLAS and OpenMP spin for 0.1 s and more after their work and occupy a core meanwhile: directly after
+    SciPy an RBF warp took 10 ms, a second later 5 ms.
     """
     begun = time.monotonic()
     while REST and time.monotonic() - begun < PATIENCE:

@@ -1,6 +1,6 @@
-"""What all peers in PyTorch share. It comes with the extra `bench`; without it their rows are left out.
+"""Helpers of the PyTorch peers. PyTorch comes with the extra `bench`; without it the peers are left out.
 
-Where JAX runs on a GPU that PyTorch sees too, so do the peers.
+The peers run on a GPU where both JAX and PyTorch do.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks import _machine
+from facejax.evaluation import run_record
 
 try:
     import torch
@@ -23,31 +23,31 @@ except ImportError:
 
 @functools.cache
 def device() -> str:
-    """Of the peers."""
+    """Return the device of the peers."""
     return "cuda" if jax.default_backend() == "gpu" and torch.cuda.is_available() else "cpu"
 
 
 def ready(threads: int | None = None) -> bool:
-    """Whether PyTorch is here; it then takes so many threads, or one for every core."""
+    """Configure PyTorch's device, precision and threads (default: one per core); return whether it is installed."""
     if torch is None:
-        print('PyTorch is not here and its rows are left out: pip install ".[bench]" brings it.', file=sys.stderr)
+        print('PyTorch is not installed, its peers are left out: pip install ".[bench]" installs it.', file=sys.stderr)
         return False
-    torch.set_num_threads(threads or _machine.cores())
+    torch.set_num_threads(threads or run_record.usable_cores())
     torch.set_default_device(device())
     torch.set_float32_matmul_precision("highest")
-    torch.backends.cudnn.allow_tf32 = False  # an LSTM's products would be of ten bits, whatever the line above says
+    torch.backends.cudnn.allow_tf32 = False  # cuDNN's LSTM ignores the line above and would use TF32
     return True
 
 
 def tensor(array: Any) -> Any:
-    """A copy on the peers' device; integers as PyTorch wants indices."""
+    """Return a copy on the peers' device; integers as int64, PyTorch's index type."""
     array = array.detach().clone() if isinstance(array, torch.Tensor) else torch.tensor(np.asarray(array))
     keeps = array.is_floating_point() or array.dtype == torch.bool
     return (array if keeps else array.long()).to(device())
 
 
 def waited(function: Callable[[], Any]) -> Callable[[], Any]:
-    """The function, and the wait for a GPU to have done it."""
+    """Return the function followed by a wait for the GPU."""
     if device() == "cpu":
         return function
 
@@ -60,7 +60,7 @@ def waited(function: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def alone(function: Callable[[], Any]) -> Callable[[], Any]:
-    """The function with one thread: for small products, or on a busy machine, that can be the faster way."""
+    """Return the function run with one thread, which can be faster for small products or on a busy machine."""
 
     def call() -> Any:
         before = torch.get_num_threads()
@@ -74,7 +74,7 @@ def alone(function: Callable[[], Any]) -> Callable[[], Any]:
 
 
 def threaded(name: str, function: Callable[[], Any]) -> dict[str, Callable[[], Any]]:
-    """The function as it is, and on a processor of several cores with one thread too."""
+    """Return the function as it is and, on a processor with several cores, with one thread as well."""
     found = {name: waited(function)}
     if device() == "cpu" and torch.get_num_threads() > 1:
         found[f"{name}, 1 thread"] = alone(function)
@@ -82,12 +82,12 @@ def threaded(name: str, function: Callable[[], Any]) -> dict[str, Callable[[], A
 
 
 def compiled(ways: Mapping[str, Callable[[], Any]]) -> dict[str, Callable[[], Any]]:
-    """Those of the compiled functions that compile here: torch.compile needs a C++ compiler."""
+    """Return the functions that torch.compile can compile here; it needs a C++ compiler."""
     found = {}
     for name, way in ways.items():
         try:
             way()
-        except Exception as error:  # whatever the compiler raises: the row is then without it, and says so
+        except Exception as error:  # of any type: the peer is left out with a message
             print(f"{name} is left out: {' '.join(str(error).split())[:200]}", file=sys.stderr)
         else:
             found[name] = waited(way)

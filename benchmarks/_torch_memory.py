@@ -1,4 +1,4 @@
-"""How much memory PyTorch holds at once on the processor."""
+"""Peak memory of PyTorch calls on the CPU."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import torch
 
 
 def peak_mb(call: Callable[[], Any], held: Iterable[torch.Tensor]) -> float:
-    """Megabytes of the tensors that are held before a call, and of the most that it adds to them at one moment."""
+    """Return the peak megabytes of a call: the tensors held before it, plus the most that it allocates at one time."""
     storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage().nbytes() for tensor in held}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns of what was allocated before it began, and is freed now
+        warnings.simplefilter("ignore")  # it warns about memory allocated before the profile
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True) as found:
             call()
     with tempfile.TemporaryDirectory() as folder:
@@ -26,5 +26,5 @@ def peak_mb(call: Callable[[], Any], held: Iterable[torch.Tensor]) -> float:
     totals = [event["args"] for event in events if event["name"] == "[memory]"]
     if not totals:
         raise RuntimeError("the profile holds no allocation")
-    before = totals[0]["Total Allocated"] - totals[0]["Bytes"]  # what earlier profiles saw and is still held
+    before = totals[0]["Total Allocated"] - totals[0]["Bytes"]  # seen by earlier profiles and still held
     return (sum(storages.values()) + max(total["Total Allocated"] for total in totals) - before) / 1e6

@@ -1,8 +1,8 @@
-"""A training of S2D-Dec on 20,000 meshes, alone in a process whose peak of memory is the training's.
+"""Training of S2D-Dec on 20,000 meshes in a process of its own, to measure its peak memory.
 
     python -m benchmarks._training_memory
 
-`benchmarks.decoder` starts it. It prints one line of JSON: seconds a step, first chunk apart, and the peak in MB.
+Started by `benchmarks.decoder`. Prints one line of JSON: seconds per step, the first chunk separately, and peak MB.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from facejax.data.synthetic import makehuman, makehuman4d
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.training.recipes import fit_s2d_dec
 
-CHUNK, CHUNKS = 50, 5  # of `fit_decoder.fit`
+CHUNK, CHUNKS = 50, 5  # steps per chunk of `fit_s2d_dec.fit`, number of chunks
 
 
 def measure() -> dict[str, float]:
-    """Some chunks of steps, with batches read from disk as always."""
+    """Train for some chunks of steps, with batches read from disk as in any training."""
     data = makehuman4d.prepare()
     everybody = mesh_subset.of_split(data, "train", "validation", "test")
     hierarchy = mesh_hierarchy.build(*makehuman.template()[:2])

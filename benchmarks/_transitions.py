@@ -1,8 +1,8 @@
-"""Made-up motions, transitions between their peaks in three forms, and a pass over many in a process of its own.
+"""Synthetic motions, transitions between their peaks in three implementations, and a pass over many transitions.
 
     python -m benchmarks._transitions '{"labels": 19, "people": 80, "count": 300000, "pace": "performed", ...}'
 
-`benchmarks.augment` starts that process: its peak of memory is the pass's alone. It prints one line of JSON.
+`benchmarks.augment` starts this process to measure the pass's peak memory. It prints one line of JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CHUNK = 128
 def made_up(
     count: int, *, labels: int, steps: int, landmarks: int, end: np.ndarray | None = None, seed: int = 0
 ) -> Motions:
-    """Smooth motions from a label's peak, everybody's own, to another's; with `end` (count,), from neutral to those."""
+    """Return smooth random motions between peaks of two labels; with `end` (count,), from neutral to those labels."""
     rng = np.random.default_rng(seed)
     start = rng.integers(labels, size=count) if end is None else np.zeros(count, int)
     end = (start + rng.integers(1, labels, size=count)) % labels if end is None else end
@@ -44,7 +44,7 @@ def made_up(
 
 
 def problem(count: int, *, labels: int, people: int, steps: int, landmarks: int) -> tuple[augment.Motions, np.ndarray]:
-    """Onsets of all labels but neutral by so many people, and `count` of all index pairs, evenly through the list."""
+    """Return onsets of all labels but neutral by all people, and `count` of their index pairs, evenly spread."""
     end = np.repeat(np.arange(1, labels), people)
     curves = made_up(len(end), labels=labels, steps=steps, landmarks=landmarks, end=end).curves
     pairs = augment.spread(end - 1, classes=labels - 1, per_pair=None)
@@ -55,7 +55,7 @@ def problem(count: int, *, labels: int, people: int, steps: int, landmarks: int)
 
 
 def forms(motions: augment.Motions, pairs: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
-    """All transitions of the pairs at the "performed" pace, chunk after chunk, made in three ways that agree."""
+    """Return three implementations of all transitions at the "performed" pace, checked to agree, as functions."""
     host = augment.Motions(*map(np.asarray, motions))
     options = {"frames": motions.q.shape[1] + 1, "pace": "performed", "chunk": CHUNK}
     parts = [pairs[low : low + CHUNK] for low in range(0, len(pairs), CHUNK)]
@@ -71,7 +71,7 @@ def forms(motions: augment.Motions, pairs: np.ndarray) -> dict[str, Callable[[],
 
 
 def stream(*, count: int, pace: str, **sizes: int) -> dict[str, float]:
-    """One pass over `count` transitions that keeps none: its time, and the peak of memory before and after, in MB."""
+    """Run a pass over `count` transitions without keeping them; return time and peak memory before and after."""
     motions, pairs = problem(count, **sizes)
     jax.block_until_ready(motions)
     before, options = _machine.peak_mb(), {"frames": motions.q.shape[1] + 1, "pace": pace, "chunk": CHUNK}
@@ -88,7 +88,7 @@ def stream(*, count: int, pace: str, **sizes: int) -> dict[str, float]:
 
 @jax.jit
 def _in_full(motions: augment.Motions, pairs: jax.Array) -> jax.Array:
-    """The plain way: every motion along the geodesic is decoded, and its last frame kept."""
+    """Plain implementation: decode every motion along the geodesic in full and keep its last frame."""
 
     def one(pair):
         first, second = (jax.tree.map(lambda x, row=row: x[row], motions) for row in pair)
@@ -106,7 +106,7 @@ def _in_full(motions: augment.Motions, pairs: jax.Array) -> jax.Array:
 
 
 def _in_numpy(motions: augment.Motions, pairs: np.ndarray) -> np.ndarray:
-    """Our way without JAX: three numbers a step for all frames, and one product of matrices a pair."""
+    """facejax's algorithm in NumPy: three numbers per step for all frames, and one matrix product per pair."""
     first, second = (augment.Motions(*(field[rows] for field in motions)) for rows in pairs.T)
     count, steps = first.q.shape[:2]
     p, q = (side.q.reshape(count, steps, -1) for side in (first, second))

@@ -1,4 +1,4 @@
-"""Training steps as functions to time."""
+"""Training steps as functions to time, and counts of their operations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from facejax.training import loop
 
 
 def scanned(step: loop.Step, count: int) -> loop.Step:
-    """So many steps on one batch in one call, as the training loop has them."""
+    """Return a step that runs `count` steps on one batch by a scan, as the training loop does."""
 
     def several(state, batch, constants):
         return jax.lax.scan(lambda state, _: step(state, batch, constants), state, length=count)
@@ -21,9 +21,9 @@ def scanned(step: loop.Step, count: int) -> loop.Step:
 
 
 def onward(step: loop.Step, state: loop.TrainState, batch: Any, constants: Any) -> Callable[[], Any]:
-    """A function that goes one call on with every call, and returns the metrics."""
+    """Return a function that advances the training state by one call of the step and returns the metrics."""
     advance = jax.jit(step, donate_argnums=0)
-    state = jax.tree.map(jax.numpy.copy, state)  # what is donated is the copy
+    state = jax.tree.map(jax.numpy.copy, state)  # the copy is donated
 
     def go() -> dict[str, jax.Array]:
         nonlocal state
@@ -34,12 +34,12 @@ def onward(step: loop.Step, state: loop.TrainState, batch: Any, constants: Any) 
 
 
 def products(function: Callable, *args: Any) -> float:
-    """Billions of multiplications and additions in a function's matrix products, as JAX writes the function down."""
+    """Return the billions of multiplications and additions of the matrix products in a function's jaxpr."""
     return 2e-9 * _multiplications(jax.make_jaxpr(function)(*args).jaxpr)
 
 
 def _multiplications(jaxpr: Any) -> int:
-    """Of one program; a scan's body as often as it runs."""
+    """Count the multiplications in a jaxpr; the body of a scan counts once per iteration."""
     total = 0
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
@@ -52,7 +52,7 @@ def _multiplications(jaxpr: Any) -> int:
 
 
 def _within(params: dict[str, Any]) -> list[Any]:
-    """The programs among an equation's parameters."""
+    """Return the jaxprs among an equation's parameters."""
 
     def is_program(leaf: Any) -> bool:
         return hasattr(leaf, "eqns") or hasattr(leaf, "jaxpr")

@@ -1,14 +1,15 @@
-"""Peak-to-peak transitions made of neutral-to-peak motions: three ways, and a pass over 300,000.
+"""Peak-to-peak transitions from neutral-to-peak motions: three implementations, and a pass over 300,000.
 
     python -m benchmarks.augment [--json FILE] [--quick]
 
-* `transitions_1280`, between 1,440 onsets, at the "performed" pace: ours, `decoded in full`, the plain way, which
-  decodes every point of the geodesics, and `NumPy`, our way there. Our way in NumPy is the peer; all must agree.
-* `transitions_300000_PACE`: many, streamed, in a process of its own whose peak of memory is shown, `before_mb` when the
-  data were there and `memory_mb` in the end. --quick takes a fifteenth.
-* `select_306000`: choosing the 1,000 nearest transitions of every pair of labels, without going through all.
+* `transitions_1280`, between 1,440 onsets, at the "performed" pace: facejax; `decoded in full`, the plain
+  implementation, which decodes every point of the geodesics; `NumPy`, facejax's algorithm in NumPy. Both are peers; all
+  three must agree.
+* `transitions_300000_PACE`: streamed in a process of its own, with its peak memory: `before_mb` once the data are
+  loaded, `memory_mb` at the end. --quick makes a fifteenth of them.
+* `select_306000`: selection of the 1,000 nearest transitions of every pair of labels, without computing all.
 
-Costs against size: transitions 128 to 8,192, and 10 to 300 frames. About a minute, --quick half.
+Cost against size: 128 to 8,192 transitions, 10 to 300 frames. About a minute, half with --quick.
 """
 
 from __future__ import annotations
@@ -31,26 +32,28 @@ ROOT = Path(__file__).parents[1]
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     labels: int = 19
+    """Number of labels."""
     people: int = 80
-    """Who perform all labels but neutral, each once."""
+    """Number of people, each performing all labels but neutral once."""
     steps: int = 29
-    """Of a motion."""
+    """Number of steps of a motion."""
     landmarks: int = 68
+    """Number of landmarks."""
     compared: int = 1280
-    """Transitions for all ways."""
+    """Number of transitions that all implementations make."""
     transitions: int = 300_000
-    """In the pass."""
+    """Number of transitions in the pass."""
     along_transitions: tuple[int, ...] = (128, 512, 2048, 8192)
-    """At which the cost is measured."""
+    """Numbers of transitions at which the cost is measured."""
     along_frames: tuple[int, ...] = (10, 30, 100, 300)
-    """At which the cost of 128 is measured."""
+    """Numbers of frames at which the cost of 128 transitions is measured."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     sizes = {name: getattr(config, name) for name in ("labels", "people", "steps", "landmarks")}
     sides = _transitions.forms(*_transitions.problem(config.compared, **sizes))
     options = {"repeats": 3 if config.quick else 9, "items": config.compared, "unit": "transitions"}
@@ -62,7 +65,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def _pass(count: int, pace: str, sizes: dict[str, int]) -> _measure.Row:
-    """One pass over many transitions in a process of its own."""
+    """Time one pass over many transitions in a process of its own."""
     found = apart(sizes | {"count": count, "pace": pace})
     seconds = found.pop("seconds")
     times = {"first_s": found.pop("first_s"), "min_s": seconds, "median_s": seconds}

@@ -1,12 +1,12 @@
-"""Data on its way: batches of meshes from a store, recordings into a store, meshes from files.
+"""Reading meshes: batches from a dataset, mesh files, and the preparation of a dataset from files.
 
     python -m benchmarks.data [--json FILE] [--quick]
 
-* `mesh_batches_b16`: random batches of displacements as a training reads them, from a store on disk.
+* `mesh_batches_b16`: random batches of displacements as training reads them, from a dataset on disk.
 * `read_ply`: a binary PLY of 5,023 vertices (CoMA's size) beside trimesh, `process=False`.
-* `prepare_2000`: `facejax data prepare folder` of 2,000 such files, every core at work, its start included.
+* `prepare_2000`: `facejax data prepare folder` on 2,000 such files with all cores, including the start of the process.
 
-Files are made up and lie in the system's cache. About a minute.
+Files are synthetic and in the page cache. About a minute.
 """
 
 from __future__ import annotations
@@ -31,18 +31,20 @@ ROOT = Path(__file__).parents[1]
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     vertices: int = 5023
+    """Number of vertices of a mesh."""
     meshes: int = 2000
-    """Files to prepare; --quick takes a tenth."""
+    """Number of files to prepare; --quick takes a tenth."""
     batch: int = 16
+    """Number of meshes of a batch."""
     store: Path | None = None
-    """A store to read batches from; by default makehuman4d, prepared first if it is not there."""
+    """Prepared dataset to read batches from; by default makehuman4d, prepared first if it is missing."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the table."""
+    """Measure and return the rows."""
     rows, repeats = [], 5 if config.quick else 15
     data = makehuman4d.prepare() if config.store is None else dataset.open_dataset(config.store)
     everybody = mesh_subset.of_split(data, "train")
@@ -65,7 +67,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def _written(root: Path, config: Config) -> list[Path]:
-    """Recordings of 50 frames, ten for each subject, as binary PLY."""
+    """Write recordings of 50 frames, ten per subject, as binary PLY; return the files."""
     rng = np.random.default_rng(0)
     side = int(np.sqrt(config.vertices)) + 1
     vertices, faces = _sheet.grid(side)
@@ -84,7 +86,7 @@ def _written(root: Path, config: Config) -> list[Path]:
 
 
 def _prepared(root: Path, count: int) -> _measure.Row:
-    """By the command line in a process of its own; every call into a folder of its own."""
+    """Time the command in a process of its own; every call writes to a new folder."""
     np.savetxt(root / "landmarks.txt", np.linspace(0, 5000, 68).astype(int), fmt="%d")
     command = [sys.executable, "-c", "from facejax.cli.main import main; main()", "data", "prepare", "folder"]
     command += ["--root", root / "raw", "--landmarks", root / "landmarks.txt", "--unit", "mm"]

@@ -1,20 +1,20 @@
-"""S2D-Dec beside PyTorch: forward of a batch and of one frame, gradient, training step, and the memory of a training.
+"""S2D-Dec against PyTorch: forward pass of a batch and of one frame, gradient, training step, and training memory.
 
     python -m benchmarks.decoder [--json FILE] [--quick]
 
-The network of OT23 as `facejax.models.decoder` has it, on a square sheet of CoMA's size: 5,041 vertices, four
-quarterings, spirals of 9, 9, 14, 15 and 15, channels 128, 64, 32, 32, 16, 3. Its operations are counted as the paper
-states them: a dense layer, then at every level the products of whole spirals on the finer side. Ours, which multiplies
-before it lifts, needs a third of those of a whole decoder.
+The network of OT23 (`facejax.models.decoders.s2d_dec`) on a square grid of CoMA's size: 5,041 vertices, four
+decimations by 4, spirals of 9, 9, 14, 15 and 15, channels 128, 64, 32, 32, 16, 3. Operations are counted as the paper
+states them: a dense layer, then at every level the products of whole spirals on the finer mesh. facejax multiplies
+before it upsamples, which needs a third of the operations of the whole decoder.
 
-Sides: `plain` is the obvious form in JAX. `rows` and `sparse` are PyTorch's, eager and compiled. `sums` is our own way
-written in PyTorch; it is not among the peers that the ratio is taken to. A training step is that of
-`facejax.fit_decoder`, loss and AdamW included; ours is timed in one call of ten, as the training loop has it, and
-alone as `single`. Outputs, gradients and losses are checked to be equal first.
+Implementations: `plain` is the direct form in JAX. `rows` and `sparse` are in PyTorch, eager and compiled. `sums` is
+facejax's algorithm in PyTorch; it does not count as a peer for the ratio. The training step is that of
+`facejax.training.recipes.fit_s2d_dec`, including loss and AdamW; facejax's is timed as ten steps in one call, as in
+the training loop, and alone as `single`. Outputs, gradients and losses are checked to be equal first.
 
-`s2d_training_20000_meshes` trains on the default dataset in a process of its own, whose peak of memory is shown; the
-first run prepares the dataset in the user's cache. Costs against size: vertices 1,000 to 100,000 (one frame) and
-batch 1 to 256. About four minutes, --quick one.
+`s2d_training_20000_meshes` trains on the default dataset in a process of its own, to measure its peak memory; the
+first run prepares the dataset in the user's cache. Cost against size: 1,000 to 100,000 vertices (one frame), batches
+of 1 to 256. About four minutes, one with --quick.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ from facejax.training import loop, steps
 
 ROOT = Path(__file__).parents[1]
 PLAN = {"rate": 1e-3, "weight_decay": 5e-5}
-SCAN = 10  # steps in one call where they are scanned
+SCAN = 10  # training steps in one call
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     side: int = 71
-    """Vertices along a side of the sheet; 71 has CoMA's size."""
+    """Number of vertices along a side of the grid; 71 gives CoMA's size."""
     batch: int = 16
-    """Samples of a batch: OT23's."""
+    """Batch size; that of OT23."""
     vertices: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)
-    """Along which the cost of one frame is measured."""
+    """Numbers of vertices at which the cost of one frame is measured."""
     batches: tuple[int, ...] = (1, 4, 16, 64, 256)
-    """Along which the cost of a batch is measured."""
+    """Batch sizes at which the cost is measured."""
     threads: int | None = None
-    """Of PyTorch, by default one for every core."""
+    """Number of PyTorch threads; by default one per core."""
 
 
 class Problem(NamedTuple):
-    """A decoder and data for it."""
+    """A decoder and its data."""
 
     params: s2d_dec.S2DDec
     hierarchy: Hierarchy
@@ -73,7 +73,7 @@ class Problem(NamedTuple):
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     with_torch, repeats = _torch.ready(config.threads), 7 if config.quick else 25
     problems = {batch: problem(config.side, batch) for batch in (config.batch, 1)}
     rows = [_forward(given, with_torch, repeats) for given in problems.values()]
@@ -86,7 +86,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def problem(side: int, batch: int) -> Problem:
-    """On a sheet of side^2 vertices."""
+    """Return a decoder and random data on a grid of side^2 vertices."""
     host = hierarchy.build(*_sheet.grid(side))
     rng = np.random.default_rng(0)
     marks, target, weights = (
@@ -96,7 +96,7 @@ def problem(side: int, batch: int) -> Problem:
 
 
 def gflop(hierarchy: Hierarchy, *, batch: int, landmarks: int = 68) -> float:
-    """Billions of operations of a forward pass, as the architecture states them."""
+    """Return the billions of operations of a forward pass, counted from the architecture."""
     channels = (*s2d_dec.CHANNELS, 3)
     levels = [*range(len(hierarchy.spirals))][::-1] + [0]
     convs = zip((hierarchy.spirals[level].size for level in levels), channels[:-1], channels[1:], strict=True)
@@ -105,7 +105,7 @@ def gflop(hierarchy: Hierarchy, *, batch: int, landmarks: int = 68) -> float:
 
 
 def plain(params: s2d_dec.S2DDec, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
-    """`decoder.apply` as one would write it first: (B, L, 3) -> (B, N, 3)."""
+    """Direct implementation of `s2d_dec.apply`: (B, L, 3) -> (B, N, 3)."""
     scale, weights = params
     x = ((displacements - scale.landmark_mean) / scale.landmark_std).reshape(len(displacements), -1)
     x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
@@ -148,7 +148,7 @@ def _gradient(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
     sides = {"facejax": slope(s2d_dec.apply), "plain": slope(plain)}
     theirs = _peers(given, "slopes") if with_torch else {}
     for way in (sides["plain"], *theirs.values()):
-        # Of its kind, each: a last kernel's slope is a hundred times one of the first.
+        # Relative to each array: the last kernel's gradient is a hundred times the first one's.
         _equal.check(jax.tree.leaves(sides["facejax"]()), jax.tree.leaves(way()), tolerance=1e-3)
     return _row("s2d_gradient", given, sides, theirs, repeats, 3)
 
@@ -169,7 +169,7 @@ def _step(given: Problem, with_torch: bool, repeats: int) -> _measure.Row:
 
 
 def training_step(given: Problem) -> tuple[loop.Step, loop.TrainState]:
-    """The step of `facejax.fit_decoder`, and where it starts."""
+    """Return the training step of `fit_s2d_dec` and its initial state."""
 
     def loss(trained, key, batch, constants):
         scale, hierarchy, weights = constants
@@ -182,7 +182,7 @@ def training_step(given: Problem) -> tuple[loop.Step, loop.TrainState]:
 
 
 def stepped(step: loop.Step, state: loop.TrainState, given: Problem) -> Callable:
-    """A function that goes on with every call."""
+    """Return a function that advances the training by one call of the step."""
     constants = (given.params.scale, given.hierarchy, given.weights)
     return _work.onward(step, state, (given.marks, given.target), constants)
 
@@ -211,12 +211,12 @@ def _data(given: Problem, count: int) -> list:
 
 
 def _way(side: str) -> str:
-    """Of a side's name: `torch rows, compiled`."""
+    """Return the implementation from a name such as `torch rows, compiled`."""
     return side.split()[1].rstrip(",")
 
 
 def _peers(given: Problem, task: str) -> dict[str, Callable]:
-    """PyTorch's three ways at a task, and the two usual ones compiled."""
+    """Return PyTorch's three implementations of a task, and the two usual ones compiled."""
     from benchmarks import _decoder_torch
 
     count = {"inference": 1, "slopes": 2, "step": 3}[task]
@@ -232,7 +232,7 @@ def _peers(given: Problem, task: str) -> dict[str, Callable]:
 
 
 def _training() -> _measure.Row:
-    """A hundred steps of a training on 20,000 meshes, in a process of its own."""
+    """Time training steps on 20,000 meshes in a process of its own."""
     command = [sys.executable, "-m", "benchmarks._training_memory"]
     printed = subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout
     found = json.loads(printed.splitlines()[-1])

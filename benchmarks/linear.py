@@ -1,15 +1,15 @@
-"""Fitting the linear models beside scikit-learn: principal components and dictionary learning of mesh displacements.
+"""Linear models against scikit-learn: principal components and dictionary learning of mesh displacements.
 
     python -m benchmarks.linear [--json FILE] [--quick]
 
-* `pca_fit`: 220 components of 3,260 vertices by three passes over 2,000 meshes in batches, in float64; scikit-learn's
-  randomised PCA of the same rank and number of passes, which holds all data at once, in float32.
-* `dictionary_fit`: 64 atoms by one pass of online dictionary learning; scikit-learn's MiniBatchDictionaryLearning with
-  the same atoms, penalty, batch and passes, coded by coordinate descent.
-* `pca_apply_b16`: a batch of landmarks to meshes beside the same two products in NumPy.
+* `pca_fit`: 220 components of 3,260 vertices by three passes over 2,000 meshes in batches, in float64; peer:
+  scikit-learn's randomised PCA of the same rank and number of passes on all data at once, in float32.
+* `dictionary_fit`: 64 atoms by one pass of online dictionary learning; peer: scikit-learn's MiniBatchDictionaryLearning
+  with the same number of atoms, penalty, batch size and passes, coded by coordinate descent.
+* `pca_apply_b16`: a batch of landmarks to meshes; peer: the same two products in NumPy.
 
-Meshes are made of 100 smooth directions and noise. The components, and the dictionary, must explain as much of them as
-the peer's do, before anything is timed. About a minute.
+Meshes are sums of 100 smooth directions and noise. The components and the dictionary must explain as much of their
+variance as the peer's do, before anything is timed. About a minute.
 """
 
 from __future__ import annotations
@@ -25,22 +25,27 @@ from benchmarks import _equal, _measure
 from facejax.models.decoders import dictionary, linear
 
 PASSES, BATCH = 3, 256
-L1 = 30.0  # of a code, in mm: a few atoms for each mesh
+L1 = 30.0  # penalty of a code in mm; gives a few atoms per mesh
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     vertices: int = 3260
+    """Number of vertices."""
     meshes: int = 2000
+    """Number of meshes."""
     components: int = 220
+    """Number of principal components."""
     atoms: int = 64
+    """Number of dictionary atoms."""
     landmarks: int = 68
+    """Number of landmarks."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the table."""
+    """Measure and return the rows."""
     landmark_index = np.arange(config.landmarks) * (config.vertices // config.landmarks)
     meshes = _meshes(config)
     batches = [(part[:, landmark_index], part) for part in np.array_split(meshes, -(-config.meshes // BATCH))]
@@ -51,7 +56,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def _meshes(config: Config) -> np.ndarray:
-    """Displacements (F, N, 3) in mm."""
+    """Return synthetic displacements (F, N, 3) in mm."""
     rng = np.random.default_rng(0)
     place = np.linspace(0, 1, config.vertices)
     waves = np.cos(np.pi * np.arange(100)[:, None] * place)
@@ -68,7 +73,7 @@ def _pca(config: Config, batches: list, meshes: np.ndarray) -> _measure.Row:
     peer = PCA(config.components, svd_solver="randomized", n_oversamples=40, iterated_power=PASSES - 1, random_state=0)
     ours = lambda: linear.pca.prepare(batches, components=config.components, passes=PASSES)  # noqa: E731
     theirs = lambda: peer.fit(rows)  # noqa: E731
-    count = 20  # the widest; the last ones are noise, of which none is wider than another
+    count = 20  # the largest; the last ones are noise of equal variance
     centred = rows - rows.mean(axis=0)
     kept, expected = (_explained(centred, found[:count]) for found in (ours().components, theirs().components_))
     _equal.check(np.array(kept), np.array(expected))
@@ -93,7 +98,7 @@ def _dictionary(config: Config, batches: list, meshes: np.ndarray, landmark_inde
 
     def theirs() -> np.ndarray:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it has not converged, which one pass does not claim
+            warnings.simplefilter("ignore")  # it warns that one pass has not converged
             return peer.fit(rows).components_
 
     kept, expected = (_explained(rows, atoms) for atoms in (ours(), theirs()))
@@ -104,7 +109,7 @@ def _dictionary(config: Config, batches: list, meshes: np.ndarray, landmark_inde
 
 
 def _explained(rows: np.ndarray, atoms: np.ndarray) -> float:
-    """The share of the variance that the atoms span."""
+    """Return the share of the variance in the span of the atoms."""
     q = np.linalg.qr(np.asarray(atoms, np.float64).T)[0]
     return float(np.sum((rows @ q) ** 2) / np.sum(rows.astype(np.float64) ** 2))
 

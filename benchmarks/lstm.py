@@ -1,21 +1,22 @@
-"""One expression network in training beside PyTorch's LSTM, six at once, and one that reads its own output.
+"""Expression networks against PyTorch's LSTM: one network, six at once, and one that feeds back its own output.
 
     python -m benchmarks.lstm [--json FILE] [--quick]
 
-Seo & Luo 2021: three layers of 128 and a dense layer, 135 frames, batches of 5 (and 32), Adam at 1e-3, masked mean
-squared error; 204 numbers a frame: 68 landmarks.
+Seo & Luo 2021: three layers of 128 units and a dense layer, 135 frames, batches of 5 (and 32), Adam at 1e-3, masked
+mean squared error; 204 numbers per frame: 68 landmarks.
 
-* `lstm_forward`, `lstm_gradient`, `lstm_train_step` of one network, from the same weights and data on both sides. Our
-  step is timed in one call of ten, as the training loop has it, and alone as `single`; its batch shared out among the
-  cores by `facejax.parallel.data_parallel` where that goes evenly, and then on one device as `one device`.
-* `lstm_train_step_x6`: six networks by `facejax.steps.vectorize_models`, shared among the cores, also one after another and
-  under `vmap`, beside six steps of PyTorch.
-* `lstm_follow`: the network that reads its own output, beside the automatic gradient of its scan.
+* `lstm_forward`, `lstm_gradient`, `lstm_train_step` of one network, from the same weights and data on both sides.
+  facejax's step is timed as ten steps in one call, as in the training loop, and alone as `single`. Its batch is sharded
+  over the cores by `facejax.training.sharding.data_parallel` where it divides evenly; then `one device` is the step on
+  one device.
+* `lstm_train_step_x6`: six networks by `facejax.training.steps.vectorize_models`, sharded over the cores, also one
+  after another and under `vmap`, against six steps of PyTorch.
+* `lstm_follow`: the network that feeds back its own output, against automatic differentiation of its scan.
 
 Outputs, gradients and the losses of the first steps are checked to be equal before anything is timed. Operations are
-those of the matrix products, as the architecture states them. Costs against size: frames 10 to 1,000, batch 1 to 256
-of a training step. The peer is eager, with a thread for every core and with one, see `benchmarks._lstm_torch`; on a
-machine that is busy with other work its threads wait for one another. About three minutes, --quick one.
+those of the matrix products, counted from the architecture. Cost against size: 10 to 1,000 frames, batches of 1 to 256
+of a training step. The peer is eager, with one thread per core and with one thread (see `benchmarks._lstm_torch`); on a
+busy machine its threads wait for one another. About three minutes, one with --quick.
 """
 
 from __future__ import annotations
@@ -36,29 +37,29 @@ from facejax.models import lstm
 from facejax.training import loop, sharding, steps
 
 RATE = 1e-3
-SCAN = 10  # steps in one call where they are scanned
+SCAN = 10  # training steps in one call
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     landmarks: int = 68
-    """Of the face; SL21 has 83."""
+    """Number of landmarks; SL21 uses 83."""
     batches: tuple[int, ...] = (5, 32)
-    """Sequences of a step."""
+    """Batch sizes."""
     frames: int = 135
-    """Of a sequence."""
+    """Number of frames of a sequence."""
     hidden: int = 128
-    """Units of each of the three layers."""
+    """Number of units of each of the three layers."""
     networks: int = 6
-    """Expressions."""
+    """Number of networks trained at once, one per expression."""
     along_frames: tuple[int, ...] = (10, 30, 100, 300, 1000)
-    """At which the cost is measured, at the first of the batches."""
+    """Numbers of frames at which the cost is measured, with the first batch size."""
     along_batch: tuple[int, ...] = (1, 4, 16, 64, 256)
-    """At which the cost is measured."""
+    """Batch sizes at which the cost is measured."""
     threads: int | None = None
-    """Of PyTorch, by default one for every core; JAX takes the cores that the process may use."""
+    """Number of PyTorch threads, by default one per core; JAX uses the cores that the process may use."""
 
 
 class Batch(NamedTuple):
@@ -70,7 +71,7 @@ class Batch(NamedTuple):
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     with_torch, repeats = _torch.ready(config.threads), 7 if config.quick else 25
     rows = []
     for batch in config.batches:
@@ -81,7 +82,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def _one(config: Config, batch: int, with_torch: bool, repeats: int) -> list[_measure.Row]:
-    """One network: forward, gradient, training step."""
+    """Time forward pass, gradient and training step of one network."""
     data, weights = _data(config, batch), _weights(config, 0)
     slope = jax.jit(jax.grad(lambda weights, data: _loss(weights, None, data, ())[0]))
     shared = _shared(batch)
@@ -119,7 +120,7 @@ def _one(config: Config, batch: int, with_torch: bool, repeats: int) -> list[_me
 
 
 def _six(config: Config, batch: int, with_torch: bool, repeats: int) -> _measure.Row:
-    """A training step of several networks, each with data of its own."""
+    """Time a training step of several networks, each with its own data."""
     count = config.networks
     names = [str(i) for i in range(count)]
     data = [_data(config, batch, seed=i) for i in range(count)]
@@ -168,7 +169,7 @@ def _six(config: Config, batch: int, with_torch: bool, repeats: int) -> _measure
 
 
 def _follow(config: Config, batch: int, repeats: int) -> list[_measure.Row]:
-    """The network that reads its own output from the start."""
+    """Time the network that feeds back its own output from the start."""
     data, weights = _data(config, batch), _weights(config, 0)
     given = jnp.zeros(data.mask.shape, bool).at[0].set(True)
     forms = {"facejax": lstm.forward_scheduled, "automatic": jax.jit(_automatic)}
@@ -202,7 +203,7 @@ def _by_size(config: Config) -> list[dict]:
 
 
 def _automatic(weights: lstm.Weights, x: jax.Array, given: jax.Array) -> jax.Array:
-    """`lstm.forward_scheduled` as a scan of `lstm.step`, which JAX differentiates by itself."""
+    """Implement `lstm.forward_scheduled` as a scan of `lstm.step`, differentiated automatically."""
 
     def advance(carry, inputs):
         states, last = carry
@@ -214,7 +215,7 @@ def _automatic(weights: lstm.Weights, x: jax.Array, given: jax.Array) -> jax.Arr
 
 
 def _data(config: Config, count: int, *, seed: int = 0) -> Batch:
-    """Sequences that go out and come back, each to somewhere of its own, at different lengths."""
+    """Return random sequences of different lengths that return to their start."""
     rng, size = np.random.default_rng(seed), 3 * config.landmarks
     length = rng.integers(config.frames // 2, config.frames, count)
     phase = np.minimum(np.arange(config.frames + 2)[:, None] / length, 1)
@@ -242,7 +243,7 @@ def _step() -> loop.Step:
 
 
 def _shared(batch: int) -> loop.Step | None:
-    """The step with its batch shared out among the devices; None where there is one, or where it does not go evenly."""
+    """Return the step sharded over the devices; None for one device, or where the batch does not divide evenly."""
     count = jax.device_count()
     return sharding.data_parallel(_step(), axis=1) if count > 1 and batch % count == 0 else None
 
@@ -252,17 +253,17 @@ def _start(weights: lstm.Weights) -> loop.TrainState:
 
 
 def _by_name(metrics: dict, names: list[str]) -> list:
-    """The losses of several models; a single one has no name."""
+    """Return the losses of several models from their metrics; that of a single model has no name."""
     return [metrics[f"loss_{name}"] for name in names] if len(names) > 1 else [metrics["loss"]]
 
 
 def _loss_of(found: Any) -> Any:
-    """A step's metrics, or losses, as losses."""
+    """Return the losses from a step's metrics, or from losses."""
     return found["loss"] if isinstance(found, dict) else found
 
 
 def _check_steps(forms: list[Callable]) -> None:
-    """The losses of three steps."""
+    """Assert that the losses of three steps agree."""
     for _ in range(3):
         expected, *others = [np.hstack(list(map(_equal.host, jax.tree.leaves(_loss_of(form()))))) for form in forms]
         for other in others:
@@ -270,7 +271,7 @@ def _check_steps(forms: list[Callable]) -> None:
 
 
 def _products(config: Config, batch: int) -> float:
-    """Billions of multiplications and additions in the matrix products of a forward pass."""
+    """Return the billions of operations of the matrix products of a forward pass."""
     size = 3 * config.landmarks
     widths = [size, config.hidden, config.hidden]
     each = sum((width + config.hidden) * 4 * config.hidden for width in widths) + config.hidden * size
@@ -278,7 +279,7 @@ def _products(config: Config, batch: int) -> float:
 
 
 def _step_products(config: Config, batch: int) -> float:
-    """The same of a gradient: two more products for each, but the first layer's inputs want no slope."""
+    """Return those of a gradient: two more products each, without the gradient of the first layer's inputs."""
     return 3 * _products(config, batch) - 2e-9 * config.frames * batch * 3 * config.landmarks * 4 * config.hidden
 
 

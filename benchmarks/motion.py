@@ -1,20 +1,21 @@
-"""Generators of motion in training beside PyTorch, and sampling from them.
+"""Training steps of the motion generators against PyTorch, and sampling from them.
 
     python -m benchmarks.motion [--json FILE] [--quick] [--whole]
 
-* `gan_step_b128`, `flow_step_b256`: a training step as `facejax.fit_motion` hands it to the loop, with its plan and
-  network (a round of the GAN: four steps of the critic, one of the generator). Ours is timed in one call of ten, as the
-  loop has it, and alone as `single`. PyTorch starts from the same weights; first, three steps on the same draws must
-  give the same metrics and weights. `memory_mb` is what our compiled program holds at once, `peer_memory_mb` what
-  PyTorch's allocator gave out at one moment of a step; data, weights and the optimiser's moments included. Operations
-  are those of the step's matrix products, gradients and the penalty's second ones among them, as JAX writes them down.
-* `gan_reference_step_b8`: the authors' GAN at an eighth of its width, in batches of 8 samples, since a step of 128
-  takes sixteen times as long and more. --whole: at full width as well.
+* `gan_step_b128`, `flow_step_b256`: a training step as `facejax.training.recipes.fit_motion` passes it to the loop,
+  with its plan and network (for the GAN, four steps of the critic and one of the generator). facejax's is timed as
+  ten steps in one call, as in the loop, and alone as `single`. PyTorch starts from the same weights; first, three
+  steps on the same random draws must give the same metrics and weights. `memory_mb` is the memory of facejax's
+  compiled program, `peer_memory_mb` the peak of PyTorch's allocator during a step, both with data, weights and the
+  optimiser's moments. Operations are those of the step's matrix products in its jaxpr, including gradients and second
+  derivatives.
+* `gan_reference_step_b8`: the authors' GAN at 1/8 of its width, in batches of 8 samples, since a step of 128 takes at
+  least sixteen times as long. --whole: at full width as well.
 * `gan_sample_64`, `flow_sample_64`: motions of one pair of labels.
 
-Motions are made up; the sizes are a training's. Costs against size: batch 4 to 256 of the GAN's step. The peer is
-eager, with a thread for every core and with one: under torch.compile the critic fails that check, and the flow gains a
-twentieth at most. About two minutes, --quick one.
+Motions are synthetic, at the sizes of a training run. Cost against size: batches of 4 to 256 of the GAN's step. The
+peer is eager, with one thread per core and with one thread: under torch.compile the critic fails the check, and the
+flow gains 5 % at most. About two minutes, one with --quick.
 """
 
 from __future__ import annotations
@@ -36,35 +37,35 @@ from facejax.models.motion import flow_matching, generators, motion3dgan, motion
 from facejax.training import loop as training_loop
 from facejax.training.recipes import fit_motion
 
-SCAN = 10  # steps in one call where they are scanned
+SCAN = 10  # training steps in one call
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     whole: bool = False
-    """The authors' GAN at full width too."""
+    """Also time the authors' GAN at full width."""
     gan: motion3dgan.Config = motion3dgan.DEFAULT
     flow: flow_matching.Config = flow_matching.DEFAULT
     gan_plan: fit_motion.GanPlan = dataclasses.field(default_factory=fit_motion.GanPlan)
     flow_plan: fit_motion.FlowPlan = dataclasses.field(default_factory=fit_motion.FlowPlan)
     reference_batch: int = 8
-    """Samples in a step of the authors' GAN."""
+    """Batch size of the authors' GAN."""
     width_divisor: int = 8
-    """Of the authors' GAN."""
+    """Divisor of all widths of the authors' GAN."""
     motions: int = 2048
-    """To train on."""
+    """Number of motions to train on."""
     samples: int = 64
-    """Drawn at once."""
+    """Number of samples drawn at once."""
     batches: tuple[int, ...] = (4, 16, 64, 256)
-    """At which the cost of a step is measured."""
+    """Batch sizes at which the cost of a step is measured."""
     threads: int | None = None
-    """Of PyTorch, by default one for every core."""
+    """Number of PyTorch threads; by default one per core."""
 
 
 class Run(NamedTuple):
-    """A training as a fit hands it to `facejax.training.run`."""
+    """A training run as a recipe passes it to `facejax.training.loop.run`."""
 
     step: training_loop.Step
     state: training_loop.TrainState
@@ -73,7 +74,7 @@ class Run(NamedTuple):
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     with_torch, repeats = _torch.ready(config.threads), 5 if config.quick else 15
     known = _transitions.made_up(
         config.motions, labels=config.gan.labels, steps=config.gan.steps, landmarks=config.gan.landmarks
@@ -100,7 +101,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def handed(fit: Callable, *args, **options) -> Run:
-    """What a fit hands to the training loop, which is not entered: what is timed is what is trained."""
+    """Return what a recipe passes to the training loop, so that the timed step is the trained one."""
     with mock.patch.object(training_loop, "run") as loop, tempfile.TemporaryDirectory() as folder:
         fit(*args, folder, **options)
     step, state, batches, _ = loop.call_args.args
@@ -108,7 +109,7 @@ def handed(fit: Callable, *args, **options) -> Run:
 
 
 def compiled(run: Run) -> tuple[Callable, float]:
-    """The step as a program of (state, rows, held), and the megabytes that it holds at once."""
+    """Compile the step of (state, rows, held); return the program and its memory in megabytes."""
     program = jax.jit(run.step, donate_argnums=0).lower(*run[1:]).compile()
     size = program.memory_analysis()
     held = size.argument_size_in_bytes + size.output_size_in_bytes - size.alias_size_in_bytes + size.temp_size_in_bytes
@@ -118,7 +119,7 @@ def compiled(run: Run) -> tuple[Callable, float]:
 def _step(
     name: str, given: Run, plan: fit_motion.GanPlan | fit_motion.FlowPlan, with_torch: bool, repeats: int
 ) -> _measure.Row:
-    """A training step beside PyTorch's."""
+    """Time a training step against PyTorch's."""
     program, memory = compiled(given)
     sides = {
         "facejax": _work.onward(_work.scanned(given.step, SCAN), given.state, given.rows, given.held),
@@ -141,7 +142,7 @@ def _step(
 
 
 def _reference(known: Motions, chart: tangent_pca.TangentPCA, config: Config) -> list[_measure.Row]:
-    """The step of the GAN as its authors built it, on few samples."""
+    """Time the training step of the authors' GAN on small batches."""
     plan, rows = fit_motion.REFERENCE._replace(batch=config.reference_batch), []
     for divisor in (config.width_divisor, 1)[: 1 + config.whole]:
         sizes = motion3dgan_reference.Config(width_divisor=divisor)
@@ -154,7 +155,7 @@ def _reference(known: Motions, chart: tangent_pca.TangentPCA, config: Config) ->
 
 
 def _sampling(name: str, params: Any, config: Config, repeats: int) -> _measure.Row:
-    """Motions of one pair of labels."""
+    """Time the sampling of motions of one pair of labels."""
     keys, pose = jax.random.split(jax.random.key(0), config.samples), jnp.zeros(config.gan.pose)
     draw = jax.jit(jax.vmap(generators.sample, (None, 0, None, None, None)))
     sides = {"facejax": lambda: draw(params, keys, 1, 2, pose)}

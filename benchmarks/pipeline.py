@@ -1,13 +1,13 @@
-"""From labels to meshes: once compiled, in a fresh process, and in a fresh process with a warm compilation cache.
+"""From labels to meshes: compiled, in a new process, and in a new process with a warm compilation cache.
 
     python -m benchmarks.pipeline [--json FILE] [--quick]
 
-* `labels_to_meshes_b16`, `_b1`: so many requests of 30 meshes of 3,260 vertices at once, as released.
-* `_linear`: by the linear answer alone (`refined=False`), `_s2d`: by S2D-Dec of the same hierarchy.
-* `new_face`: what a face that was not seen before costs once.
-* `fresh_process_*`: from the first import to 30 meshes, with nothing compiled and with the cache warm; once each.
+* `labels_to_meshes_b16`, `_b1`: 16 requests and one request of 30 meshes of 3,260 vertices, by the released models.
+* `_linear`: by the GPMM estimate alone (`refined=False`); `_s2d`: by S2D-Dec on the same mesh hierarchy.
+* `new_face`: the one-off cost of a new face.
+* `fresh_process_*`: from the first import to 30 meshes, with an empty and with a warm compilation cache; once each.
 
-There is no peer: nothing else does this. Costs against size: 1 to 256 requests. About a minute.
+There is no peer: no other library does this. Cost against size: 1 to 256 requests. About a minute.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ jax.block_until_ready(pipeline.meshes(models, landmarks, models.face.vertices))
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     requests: tuple[int, ...] = (16, 1)
-    """At once."""
+    """Numbers of simultaneous requests."""
     along_requests: tuple[int, ...] = (1, 4, 16, 64, 256)
-    """At which the cost of the linear answer and of S2D-Dec is measured; as released up to the third."""
+    """Numbers of requests at which the cost is measured; the first three of them for the released models."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     models = pipeline.load()
     spiral = models._replace(decoder=s2d_dec.init(jax.random.key(0), models.hierarchy))
     ways = {"": (models, {}), "_linear": (models, {"refined": False}), "_s2d": (spiral, {})}
@@ -76,14 +76,14 @@ def run(config: Config) -> _measure.Found:
 
 
 def made(models: pipeline.Models, samples: int, **options: bool) -> jax.Array:
-    """So many motions of one pair of labels, as meshes."""
+    """Generate motions of one pair of labels as meshes."""
     neutral = models.face.vertices
     landmarks = pipeline.landmarks(models, jax.random.key(0), LABELS, neutral, samples=samples)
     return pipeline.meshes(models, landmarks, neutral, **options)
 
 
 def _fresh(folder: str) -> float:
-    """Seconds from the first import to 30 meshes, in a new process."""
+    """Return the seconds from the first import to 30 meshes, in a new process."""
     environment = os.environ | {"FACEJAX_CACHE": folder}
     begun = time.perf_counter()
     subprocess.run([sys.executable, "-c", FRESH], env=environment, check=True, capture_output=True)

@@ -1,16 +1,17 @@
-"""68 landmarks carried to 10,000 vertices over 135 frames: in one product, by SciPy, and with a system for each frame.
+"""RBF warps of 10,000 vertices by 68 landmarks over 135 frames, against SciPy and against a system for each frame.
 
     python -m benchmarks.rbf [--json FILE] [--quick]
 
-* `rbf_135x10000`: everything from a new face to its motion: the system, weights, all frames. SciPy's RBFInterpolator
-  takes all 405 channels in one call. `weights and warp` leaves out the system, `warp` is what another motion of the
-  same face costs.
-* `rbf_refit_135x10000`: the same beside Seo & Luo's (2021) way, a new system for every frame, by SciPy: another answer,
-  which depends on the path, see `rbf.refit`. `refit` is ours of that kind, and what SciPy's is checked against.
+* `rbf_135x10000`: everything from a new face to its motion: the system, the weights, all frames. SciPy's
+  RBFInterpolator takes all 405 channels in one call. `weights and warp` leaves out the system; `warp` is the cost of
+  another motion of the same face.
+* `rbf_refit_135x10000`: the same against the method of Seo & Luo (2021), a new system for every frame, in SciPy. Its
+  result differs, since it depends on the path, see `rbf.refit`. `refit` is facejax's implementation of it, and
+  SciPy's is checked against it.
 
-All else gives the same displacements, which is checked first. SciPy's calls work in float64 throughout, ours in
-float64 up to the weights. Operations are those of two products, a vertex's weights (L + 4 by L) and its frames (L by
-3 T), bytes those of the frames. Costs against size: vertices 1,000 to 100,000 and frames 10 to 1,000. About a minute.
+All others give the same displacements, which is checked first. SciPy works in float64 throughout, facejax in float64
+up to the weights. Operations are those of two products, a vertex's weights (L + 4 by L) and its frames (L by 3 T);
+bytes are those of the frames. Cost against size: 1,000 to 100,000 vertices, 10 to 1,000 frames. About a minute.
 """
 
 from __future__ import annotations
@@ -29,20 +30,20 @@ from facejax.geometry import rbf
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     vertices: int = 10_000
-    """Of the mesh."""
+    """Number of vertices of the mesh."""
     frames: int = 135
-    """Of the motion: SL21's sequences."""
+    """Number of frames; that of SL21's sequences."""
     along_vertices: tuple[int, ...] = (1_000, 3_000, 10_000, 30_000, 100_000)
-    """At which the cost is measured."""
+    """Numbers of vertices at which the cost is measured."""
     along_frames: tuple[int, ...] = (10, 30, 100, 300, 1000)
-    """At which the cost is measured."""
+    """Numbers of frames at which the cost is measured."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     rest, vertices, moved = _problem(config.vertices, config.frames)
     found = rbf.fit(rest)
     weights = jax.device_put(rbf.weights(found, vertices))
@@ -70,7 +71,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def _problem(count: int, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Landmarks (68, 3) of MakeHuman's head, points (count, 3) of its surface, displacements (frames, 68, 3), mm."""
+    """Return landmarks (68, 3) and surface points (count, 3) of MakeHuman's head, displacements (frames, 68, 3); mm."""
     shape = makehuman.template()
     rng = np.random.default_rng(0)
     corners = shape.vertices[shape.faces[rng.integers(len(shape.faces), size=count)]].astype(np.float64)
@@ -85,14 +86,14 @@ def _before(moved: np.ndarray) -> np.ndarray:
 
 
 def _scipy(rest: np.ndarray, moved: np.ndarray, vertices: np.ndarray, unit: float) -> np.ndarray:
-    """Displacements (T, N, 3) of all frames in one call."""
+    """Return the displacements (T, N, 3) of all frames by one call of SciPy."""
     channels = np.moveaxis(moved, 1, 0).reshape(len(rest), -1)
     peer = RBFInterpolator(rest, channels, kernel="multiquadric", epsilon=1 / unit, degree=1)
     return np.moveaxis(peer(vertices).reshape(len(vertices), -1, 3), 1, 0)
 
 
 def _scipy_refit(rest: np.ndarray, moved: np.ndarray, vertices: np.ndarray, units: list[float]) -> np.ndarray:
-    """`rbf.refit` with SciPy's interpolator for each step."""
+    """`rbf.refit` with SciPy's interpolator for each frame."""
     at, out = vertices.copy(), []
     for before, here, unit in zip(_before(moved), moved, units, strict=True):
         at = at + RBFInterpolator(rest + before, here - before, kernel="multiquadric", epsilon=1 / unit, degree=1)(at)

@@ -1,16 +1,16 @@
-"""Two devices beside one, and large corpora.
+"""Scaling: several devices against one, and large corpora.
 
     python -m benchmarks.scale [--json FILE] [--quick]
 
-* `s2d_step_devices`, `lstm_step_devices`: a training step whose batch is shared out among the cores, each of them a
-  device (`facejax.parallel.data_parallel`), beside one device, which itself uses all cores where products are large
-  enough. `efficiency` is what is gained, by the number of devices.
+* `s2d_step_devices`, `lstm_step_devices`: a training step whose batch is sharded over the cores, each a device
+  (`facejax.training.sharding.data_parallel`), against one device, which itself uses all cores for large products.
+  `efficiency` is the speed-up divided by the number of devices.
 * `corpus_devices`: motions of a corpus, likewise.
 * `corpus_N`: a corpus of N motions with its index, written to the system's temporary folder.
-* `corpus_1000000`: what a million take, told from the measured ones, by the cost of one more motion.
+* `corpus_1000000`: a million motions, extrapolated from the measured ones by the cost of one more motion.
 
-Losses of the first steps and the motions are checked to be equal. Costs against size: motions of a corpus. About three
-minutes, --quick one.
+Losses of the first steps and the motions are checked to be equal. Cost against size: motions of a corpus. About three
+minutes, one with --quick.
 """
 
 from __future__ import annotations
@@ -35,31 +35,31 @@ from facejax.models import lstm
 from facejax.models.decoders import s2d_dec
 from facejax.training import loop, sharding, steps
 
-SCAN = 5  # steps in one call
+SCAN = 5  # training steps in one call
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     side: int = 71
-    """Of the square sheet that S2D-Dec is trained on."""
+    """Number of vertices along a side of the grid that S2D-Dec is trained on."""
     meshes: int = 16
-    """In a batch."""
+    """Number of meshes of a batch."""
     frames: int = 135
-    """Of a recording that an expression network is trained on."""
+    """Number of frames of a recording that an expression network is trained on."""
     recordings: int = 32
-    """In a batch."""
+    """Number of recordings of a batch."""
     motions: int = 512
-    """Of a corpus, where devices are compared."""
+    """Number of motions of the corpus for the comparison of devices."""
     sequences: tuple[int, ...] = (100, 1_000, 10_000)
-    """Of the corpora that are written; --quick leaves out the last."""
+    """Numbers of motions of the corpora to write; --quick leaves out the last."""
     million: int = 1_000_000
-    """Motions of which the cost is told from those."""
+    """Number of motions whose cost is extrapolated."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     repeats = 3 if config.quick else 9
     models = pipeline.load()
     rows = [_step("s2d_step_devices", *_meshes(config), 0, repeats)]
@@ -70,11 +70,11 @@ def run(config: Config) -> _measure.Found:
     sizes = [
         {"name": "corpus", "axis": "motions", "size": row["motions"]} | {k: row[k] for k in keys} for row in written
     ]
-    return [*rows, *written, _told(written, config.million)], [] if config.quick else sizes
+    return [*rows, *written, _extrapolated(written, config.million)], [] if config.quick else sizes
 
 
 def _meshes(config: Config):
-    """S2D-Dec's loss, weights and a batch."""
+    """Return loss, weights, batch and constants of S2D-Dec."""
     host = mesh_hierarchy.build(*_sheet.grid(config.side))
     params, hierarchy = s2d_dec.init(jax.random.key(0), host), jax.device_put(host)
     rng = np.random.default_rng(0)
@@ -89,7 +89,7 @@ def _meshes(config: Config):
 
 
 def _recordings(config: Config):
-    """The same of an expression network, time first."""
+    """Return loss, weights, batch (time first) and constants of an expression network."""
     weights = lstm.init(jax.random.key(0), 204)
     rng = np.random.default_rng(0)
     shape = (config.frames, config.recordings, 204)
@@ -134,7 +134,7 @@ def _shared(row: _measure.Row) -> _measure.Row:
 
 
 def _written(models: pipeline.Models, count: int) -> _measure.Row:
-    """Once; the program has been compiled before."""
+    """Write a corpus once; the program is compiled already."""
     neutrals = {"average": models.face.vertices}
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
@@ -145,8 +145,8 @@ def _written(models: pipeline.Models, count: int) -> _measure.Row:
     return _measure.lone(f"corpus_{count}", times, items=count, unit="motions", motions=count, megabytes=size / 1e6)
 
 
-def _told(written: list[_measure.Row], count: int) -> _measure.Row:
-    """By the two largest that were measured."""
+def _extrapolated(written: list[_measure.Row], count: int) -> _measure.Row:
+    """Extrapolate from the two largest corpora that were measured."""
     less, more = written[-2:]
     rates = {key: (more[key] - less[key]) / (more["motions"] - less["motions"]) for key in ("median_s", "megabytes")}
     found = {key: more[key] + (count - more["motions"]) * rate for key, rate in rates.items()}

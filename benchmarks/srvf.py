@@ -1,16 +1,17 @@
-"""SRVF encode and decode, and geodesic interpolation, of 1,000 motions of 30 x 204, beside fdasrsf and geomstats.
+"""SRVF encoding, decoding and geodesic interpolation of 1,000 motions of 30 x 204, against fdasrsf and geomstats.
 
     python -m benchmarks.srvf [--json FILE] [--quick] [--geomstats PYTHON]
 
 * `srvf_encode_decode`: motions to points on the sphere, and back.
-* `geodesic`: halfway between 1,000 pairs of points.
+* `geodesic`: the midpoints of 1,000 pairs of points.
 
-fdasrsf takes one curve at a time. geomstats takes them all; it needs an older NumPy, so that it runs in turns with us
-in an interpreter of its own: `make geomstats` installs it in .venv-geomstats, where it is looked for. NumPy is our way
-there, so that it is seen what the library and what the compiler does. Both peers work in float64. Results are checked
-first: geodesics and the transform of geomstats agree with ours; fdasrsf takes central differences and a trapezoid
-where we and the paper's eq 1 take steps, so that a smooth motion comes back within a hundredth of its extent. Bytes
-are what must be read and written. Costs against size: motions 10 to 10,000 and frames 10 to 1,000. About a minute.
+fdasrsf takes one curve at a time. geomstats takes all at once; it needs an older NumPy and runs in an environment of
+its own, in turns with facejax: `make geomstats` installs it in .venv-geomstats. `NumPy` is facejax's algorithm in
+NumPy, to separate the effect of the library from that of the compiler. Both peers work in float64. Results are
+checked first: geomstats agrees with facejax; fdasrsf uses central differences and the trapezoidal rule where facejax
+and the paper's eq. 1 use forward differences, so that it reconstructs a smooth motion within a hundredth of its
+extent. Bytes are those that must be read and written. Cost against size: 10 to 10,000 motions, 10 to 1,000 frames.
+About a minute.
 """
 
 from __future__ import annotations
@@ -37,21 +38,24 @@ ROOT = Path(__file__).parents[1]
 
 @dataclasses.dataclass(frozen=True)
 class Config(_measure.Options):
-    """What to measure."""
+    """Options of the benchmark."""
 
     motions: int = 1000
+    """Number of motions."""
     frames: int = 30
+    """Number of frames."""
     landmarks: int = 68
+    """Number of landmarks."""
     geomstats: Path = ROOT / ".venv-geomstats" / "bin" / "python"
-    """An interpreter that has geomstats; without it its figures are left out."""
+    """Python interpreter with geomstats installed; without it the peer is left out."""
     along_motions: tuple[int, ...] = (10, 100, 1000, 10_000)
-    """At which the cost is measured."""
+    """Numbers of motions at which the cost is measured."""
     along_frames: tuple[int, ...] = (10, 30, 100, 300, 1000)
-    """At which the cost of 100 motions is measured."""
+    """Numbers of frames at which the cost of 100 motions is measured."""
 
 
 def run(config: Config) -> _measure.Found:
-    """Rows of the tables."""
+    """Measure and return the rows."""
     curves = smooth(config.motions, config.frames, config.landmarks)
     points, other = points_of(curves)
     tasks = {"encode_decode": round_trip(curves), "geodesic": lambda: halfway(points, other)}
@@ -74,7 +78,7 @@ def run(config: Config) -> _measure.Found:
 
 
 def smooth(motions: int, frames: int, landmarks: int) -> jax.Array:
-    """Motions (K, T, L, 3) in mm that go out and come back, each on a way of its own."""
+    """Return random smooth motions (K, T, L, 3) in mm that return to their start."""
     rng = np.random.default_rng(0)
     tau = np.linspace(0, 1, frames)[:, None, None]
     parts = [np.sin(np.pi * k * tau) * rng.normal(size=(motions, 1, landmarks, 3)) / k for k in (1, 2, 3)]
@@ -82,19 +86,20 @@ def smooth(motions: int, frames: int, landmarks: int) -> jax.Array:
 
 
 def points_of(curves: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The motions' points on the sphere, and each one's neighbour."""
+    """Return the motions' points on the sphere, and the same shifted by one, as second ends of geodesics."""
     points = srvf.encode(curves)[0]
     return points, jnp.roll(points, 1, axis=0)
 
 
 def round_trip(curves: jax.Array) -> Callable[[], jax.Array]:
-    """All motions encoded and decoded."""
+    """Return a function that encodes and decodes all motions."""
     there_and_back = jax.jit(lambda curves: srvf.decode(*srvf.encode(curves), curves[:, 0]))
     return lambda: there_and_back(curves)
 
 
 @jax.jit
 def halfway(first: jax.Array, second: jax.Array) -> jax.Array:
+    """Return the midpoints of geodesics."""
     return sphere.geodesic(first, second, 0.5)
 
 
@@ -124,11 +129,11 @@ def _numpy_halfway(first: jax.Array, second: jax.Array) -> Callable[[], np.ndarr
 
 
 def _one_by_one(curves: np.ndarray) -> dict[str, dict[str, Callable]]:
-    """By fdasrsf; curves are (K, T, L, 3), its own (D, T)."""
+    """Return fdasrsf's implementations, which take one curve (D, T) at a time; `curves` are (K, T, L, 3)."""
     try:
         from fdasrsf import curve_functions
     except ImportError:
-        print('fdasrsf is not here and its figures are left out: pip install ".[bench]" brings it.', file=sys.stderr)
+        print('fdasrsf is not installed, the peer is left out: pip install ".[bench]" installs it.', file=sys.stderr)
         return {}
     flat = np.ascontiguousarray(curves.reshape(*curves.shape[:2], -1).transpose(0, 2, 1))
 
@@ -155,9 +160,9 @@ def _one_by_one(curves: np.ndarray) -> dict[str, dict[str, Callable]]:
 
 @contextlib.contextmanager
 def _geomstats(python: Path, curves: np.ndarray) -> Iterator[dict[str, dict[str, Callable]]]:
-    """geomstats in a process that waits for tasks."""
+    """Start geomstats in a process that waits for tasks, and return its implementations."""
     if not python.exists():
-        print(f"{python} is not there and geomstats is left out: `make geomstats` installs it.", file=sys.stderr)
+        print(f"{python} is missing, the peer geomstats is left out: `make geomstats` installs it.", file=sys.stderr)
         yield {}
         return
     with tempfile.TemporaryDirectory() as name:
@@ -166,7 +171,7 @@ def _geomstats(python: Path, curves: np.ndarray) -> Iterator[dict[str, dict[str,
         command = [python, Path(__file__).with_name("_geomstats.py"), folder]
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         # What `runtime.keep_memory` does for everybody in this process.
-        environment |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 30), "MALLOC_TRIM_THRESHOLD_": str(runtime.KEPT)}
+        environment |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 30), "MALLOC_TRIM_THRESHOLD_": str(runtime.MAX_FREE_BYTES)}
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
         ) as child:
@@ -175,10 +180,10 @@ def _geomstats(python: Path, curves: np.ndarray) -> Iterator[dict[str, dict[str,
                 child.stdin.write(line + "\n")
                 child.stdin.flush()
                 if child.stdout.readline() != "done\n":
-                    raise RuntimeError("geomstats has stopped; its error stands above")
+                    raise RuntimeError("the geomstats process has stopped; see its error above")
 
             if child.stdout.readline() != "ready\n":
-                raise RuntimeError("geomstats did not start; its error stands above")
+                raise RuntimeError("the geomstats process did not start; see its error above")
 
             def saved(task: str) -> np.ndarray:
                 ask(f"save {task}")
@@ -194,11 +199,11 @@ def _geomstats(python: Path, curves: np.ndarray) -> Iterator[dict[str, dict[str,
 
 
 def _check(curves: jax.Array, points: jax.Array, other: jax.Array, theirs: dict) -> None:
-    """A fast wrong answer is no answer."""
+    """Assert that the peers agree with facejax."""
     back, half = round_trip(curves)(), halfway(points, other)
     _equal.check(back, curves)
     for side, call in theirs["encode_decode"].items():
-        if side == "geomstats":  # from the origin, without the first frame
+        if side == "geomstats":  # starts at the origin, without the first frame
             moved = (curves - curves[:, :1])[:, 1:]
             _equal.check(moved, call.result().reshape(moved.shape))
         else:

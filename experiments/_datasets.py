@@ -1,4 +1,7 @@
-"""Who is trained on and judged in the experiments on landmarks -> mesh: the folds of each protocol, OT23's too."""
+"""Datasets and cross-validation folds of the experiments on landmarks to mesh, including the protocols of OT23 4.1.
+
+A *case* is one fold of one protocol (`identity`, `expression` or `test`): training meshes and test meshes.
+"""
 
 from __future__ import annotations
 
@@ -15,75 +18,78 @@ from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d
 from facejax.io import cache
 from facejax.mesh import hierarchy, rbf_weights
 
-MOST = 20_000  # meshes of a case; more are thinned by a fixed draw
+MAX_MESHES = 20_000  # of a case; larger sets are subsampled at random with a fixed seed
 FOLDS = 4
-QUICK = {"subjects": 24, "meshes": 1_200}  # of makehuman4d
+QUICK = {"subjects": 24, "meshes": 1_200}  # size of makehuman4d with --quick
 Mode = Literal["quick", "default", "paper"]
 
 
 class Case(NamedTuple):
-    """One fold: what to fit to, what to judge on, and what is new in it."""
+    """One fold of a protocol: the meshes to fit to and the meshes to evaluate on."""
 
     split: str
     fold: int
     train: MeshSubset
     test: MeshSubset
-    by: str  # "subjects" or "labels"
+    by: str  # what the test set holds out: "subjects" or "labels"
 
     @property
     def name(self) -> str:
-        """The folder's name."""
+        """Return the name of the case's folder."""
         return f"{self.split}-{self.fold}"
 
 
-def data_of(
+def load(
     path: Path | None, mode: Mode, *, level: int = 3, noise: float = 0.0, seed: int = makehuman4d.SEED
 ) -> dataset.Dataset:
-    """The user's store, or makehuman4d: a small one of 24 people for `quick`."""
+    """Open the dataset at `path`, else prepare makehuman4d, with 24 subjects in quick mode."""
     if path is not None:
         return dataset.open_meshes(path)
     size = QUICK if mode == "quick" else {}
     return makehuman4d.prepare(makehuman4d.Spec(level=level, noise=noise, seed=seed, **size))
 
 
-def check_alike(a: dataset.Dataset, b: dataset.Dataset) -> None:
-    """Raise `ValueError` for two datasets of other triangles or landmarks."""
+def check_same_topology(a: dataset.Dataset, b: dataset.Dataset) -> None:
+    """Raise `ValueError` unless two datasets have the same triangles and landmark vertices."""
     for name in ("faces", "landmark_index"):
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             what = "triangles" if name == "faces" else "landmarks"
-            raise ValueError(f"{a.path} and {b.path} have other {what}: both have to be in one topology")
+            raise ValueError(f"{a.path} and {b.path} have different {what}: both need the same mesh topology")
 
 
 def is_makehuman(data: dataset.Dataset) -> bool:
-    """Whether the store holds the embedded dataset."""
+    """Return whether the dataset is makehuman4d, the built-in one."""
     return data.index.get("name") == "makehuman4d"
 
 
 def cases(data: dataset.Dataset, splits: Sequence[str]) -> list[Case]:
-    """The folds of each protocol.
+    """Return the cases of each protocol.
 
-    `identity`: four folds over the sorted training and validation subjects. `expression`: four over the sorted names of
-    CoMA's expressions, of the same people; other data: over all names. `test`: fitted to all those people, judged on
-    the test subjects. Datasets of OT23 4.1 get the paper's splits, over all their people: CoMA these folds, D3DFACS,
-    Florence 4D and BU-3DFE splits of their own.
+    `identity`: four folds over the sorted training and validation subjects. `expression`: four folds over the sorted
+    expression labels of the same subjects, on makehuman4d those of CoMA. `test`: fit to all those subjects, evaluate on
+    the test subjects. The datasets of OT23 4.1 use the paper's splits over all their subjects: CoMA the four folds,
+    D3DFACS, Florence 4D and BU-3DFE a split each.
+
+    Raises:
+        ValueError: for an unknown protocol, or where a split leaves no training or no test meshes.
     """
     known = [split for split in _with_people(data) if split != "test"]
-    people = at_most(of_split(data, *known))
+    people = limit_count(of_split(data, *known))
     name = data.index.get("name")
-    everybody = people if name not in _PUBLISHED else at_most(of_split(data, *_with_people(data)))
+    everybody = people if name not in _PUBLISHED else limit_count(of_split(data, *_with_people(data)))
     found = []
     for split in splits:
         if split == "test":
-            found.append(Case("test", 0, people, at_most(of_split(data, "test")), "subjects"))
+            found.append(Case("test", 0, people, limit_count(of_split(data, "test")), "subjects"))
         elif split in ("identity", "expression"):
             found += _PUBLISHED.get(name, _four_folds)(everybody, split)
         else:
             raise ValueError(f"unknown split {split!r}, expected identity, expression or test")
     for case in found:
         if not case.train.count or not case.test.count:
-            what = "fit to" if not case.train.count else "judge on"
+            which = "training" if not case.train.count else "test"
             raise ValueError(
-                f"{data.path}: the split by {case.split} leaves nothing to {what}: too few people, or names"
+                f"{data.path}: the {case.split} split leaves no {which} meshes: too few subjects or expression labels"
             )
     return found
 
@@ -104,28 +110,28 @@ def _one_fold(people: MeshSubset, split: str, held: np.ndarray) -> list[Case]:
 
 
 def _d3dfacs(people: MeshSubset, split: str) -> list[Case]:
-    """The last seven subjects train; the first eleven expressions of each are left out."""
+    """Train on the last seven subjects, or hold out the first eleven expressions of each subject."""
     if split == "identity":
         return _one_fold(people, split, ~np.isin(people.owner, people.subjects[-7:]))
     return _one_fold(people, split, _first_of_each(people, 11))
 
 
 def _florence(people: MeshSubset, split: str) -> list[Case]:
-    """The last 30 women and 10 men, or the first two expressions of each, are left out."""
+    """Hold out the last 30 women and 10 men, or the first two expressions of each subject."""
     if split == "expression":
         return _one_fold(people, split, _first_of_each(people, 2))
     sex = np.array([people.data.index["subjects"][i].get("sex", "") for i in people.subjects])
     if unknown := [people.data.index["subjects"][i]["name"] for i in people.subjects[~np.isin(sex, registry.SEXES)]]:
         raise ValueError(
-            f"{people.data.path}: nothing says whether {unknown[0]} is female or male, by which Florence 4D is split: "
-            "prepare it with --people"
+            f"{people.data.path}: subject {unknown[0]} has no sex (female or male), which the Florence 4D split needs: "
+            "prepare the dataset with --people"
         )
     held = np.concatenate([people.subjects[sex == "female"][-30:], people.subjects[sex == "male"][-10:]])
     return _one_fold(people, split, np.isin(people.owner, held))
 
 
 def _bu3dfe(people: MeshSubset, split: str) -> list[Case]:
-    """The first ten subjects, or anger and disgust, are left out."""
+    """Hold out the first ten subjects, or the expressions anger and disgust."""
     if split == "identity":
         return _one_fold(people, split, np.isin(people.owner, people.subjects[:10]))
     return _one_fold(people, split, np.isin(people.labels, ["angry", "anger", "disgust"]))
@@ -142,30 +148,30 @@ def _first_of_each(people: MeshSubset, count: int) -> np.ndarray:
 _PUBLISHED = {"coma": _four_folds, "d3dfacs": _d3dfacs, "florence4d": _florence, "bu3dfe": _bu3dfe}
 
 
-def at_most(meshes: MeshSubset) -> MeshSubset:
-    """The meshes, or a fixed draw of 20,000 of them."""
-    if meshes.count <= MOST:
+def limit_count(meshes: MeshSubset) -> MeshSubset:
+    """Return the meshes, or a random subset of `MAX_MESHES` drawn with a fixed seed."""
+    if meshes.count <= MAX_MESHES:
         return meshes
-    keep = np.sort(np.random.default_rng(0).permutation(meshes.count)[:MOST])
+    keep = np.sort(np.random.default_rng(0).permutation(meshes.count)[:MAX_MESHES])
     return meshes.where(np.isin(np.arange(meshes.count), keep))
 
 
-def regions_of(data: dataset.Dataset) -> dict[str, np.ndarray]:
-    """The whole head, and the face: 25 mm along the surface about a landmark."""
+def region_masks(data: dataset.Dataset) -> dict[str, np.ndarray]:
+    """Return vertex masks (N,) of the head (all vertices) and the face (within 25 mm geodesic of a landmark)."""
     if is_makehuman(data):
         mask = makehuman.template().face_mask
     else:
-        mask = rbf_weights.face_region(template_of(data), np.asarray(data.faces), np.asarray(data.landmark_index))
+        mask = rbf_weights.face_region(template_vertices(data), np.asarray(data.faces), np.asarray(data.landmark_index))
     return {"head": np.ones_like(mask), "face": mask}
 
 
-def hierarchy_of(data: dataset.Dataset) -> hierarchy.Hierarchy:
-    """The levels that spiral networks climb."""
-    return hierarchy.build(template_of(data), np.asarray(data.faces), cache=cache.folder())
+def mesh_hierarchy(data: dataset.Dataset) -> hierarchy.Hierarchy:
+    """Return the mesh hierarchy for spiral networks on the dataset's template."""
+    return hierarchy.build(template_vertices(data), np.asarray(data.faces), cache=cache.folder())
 
 
-def template_of(data: dataset.Dataset) -> np.ndarray:
-    """The face on which tables are made: makehuman4d's own, else the mean of the training subjects."""
+def template_vertices(data: dataset.Dataset) -> np.ndarray:
+    """Return the vertices (N, 3) of MakeHuman's template, else the mean neutral face of the training subjects."""
     if is_makehuman(data):
         return makehuman.template().vertices
     return np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0)

@@ -1,6 +1,8 @@
-"""What `experiments.interpolation` makes and measures: motions between two performed ones, and from peak to peak.
+"""Construction and evaluation of interpolated motions for `experiments.interpolation`.
 
-Everything is a displacement from neutral, unitless; measures take the millimetres per unit.
+Motions are interpolated between the onsets (neutral to peak) of two people, and transitions from peak to peak are
+built from the onsets of one person. Curves are unitless displacements from neutral; `scale` gives the millimetres per
+unit. A variant of a transition is a path, on the sphere of SRVFs or straight, and a pace, the timing along it.
 """
 
 from __future__ import annotations
@@ -16,34 +18,40 @@ import numpy as np
 from facejax import augment, metrics
 from facejax.data import dataset, motions
 from facejax.data.synthetic import makehuman, performance, rig
+from facejax.evaluation import motion_metrics
 from facejax.geometry import sphere, srvf
 
 PATHS = ("sphere", "linear")
 PACES = ("even", "minimum jerk", "performed")
-WAYS = tuple((path, pace) for path in PATHS for pace in PACES)  # from one peak to another
-TAUS = (0.25, 0.5, 0.75)  # places between two motions
+VARIANTS = tuple((path, pace) for path in PATHS for pace in PACES)
+TAUS = (0.25, 0.5, 0.75)  # interpolation parameters between two motions
+_MEASURES = {
+    "length": motion_metrics.length,
+    "peak": motion_metrics.end_norm,
+    "acceleration": motion_metrics.acceleration,
+}
 
 
-class Walk(NamedTuple):
-    """K motions from peak to peak."""
+class PeakTransitions(NamedTuple):
+    """K transitions from peak to peak."""
 
     curves: np.ndarray  # (K, T, L, 3)
-    tau: np.ndarray  # (K, T): the share of the way that each frame has gone
+    tau: np.ndarray  # (K, T): fraction of the path covered at each frame
 
 
-def joined(data: dataset.Dataset, splits: Sequence[str], only=motions.halves) -> motions.Motions:
-    """`motions.halves` or `motions.direct_transitions` of several splits."""
-    return motions.join(*(only(data, split) for split in splits))
+def read_splits(data: dataset.Dataset, splits: Sequence[str], read=motions.halves) -> motions.Motions:
+    """Read the motions of several splits with `read` and join them."""
+    return motions.join(*(read(data, split) for split in splits))
 
 
-def onsets_of(halves: motions.Motions) -> motions.Motions:
-    """Neutral -> peak alone."""
+def onsets_only(halves: motions.Motions) -> motions.Motions:
+    """Return the motions that start at neutral."""
     return halves.take(halves.start == 0)
 
 
 @partial(jax.jit, static_argnames="path")
-def between(first: jax.Array, second: jax.Array, tau: jax.Array | float, *, path: str) -> jax.Array:
-    """The motions (K, T, L, 3) at a fraction tau of the way between two: on the sphere, or frame by frame in 3D."""
+def interpolate(first: jax.Array, second: jax.Array, tau: jax.Array | float, *, path: str) -> jax.Array:
+    """Interpolate between motions (K, T, L, 3) at the fraction tau, on the sphere of SRVFs or frame by frame in 3D."""
     if path == "linear":
         return (1 - tau) * first + tau * second
     (q1, length1), (q2, length2) = srvf.encode(first), srvf.encode(second)
@@ -51,11 +59,12 @@ def between(first: jax.Array, second: jax.Array, tau: jax.Array | float, *, path
     return srvf.decode(sphere.geodesic(q1, q2, tau), (1 - tau) * length1 + tau * length2, start)
 
 
-def walk(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> Walk:
-    """From the last frames of the onsets `first` to those of `second`, both (K, T, L, 3).
+def peak_transitions(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> PeakTransitions:
+    """Build transitions from the last frames of the onsets `first` to those of `second`, both (K, T, L, 3).
 
-    On the "sphere": `augment.transition`. "linear": straight from peak to peak. `pace` "performed" is that of `second`,
-    as in `augment.transitions`; "minimum jerk" is the one that hands and faces start and stop at.
+    Args:
+        path: "sphere" is `augment.transition`; "linear" is the straight line from peak to peak.
+        pace: "even"; "minimum jerk" (Flash & Hogan 1985); "performed", that of `second`, as in `augment.transitions`.
     """
     frames = first.shape[1]
     (q1, length1), (q2, length2) = (srvf.encode(jnp.asarray(x)) for x in (first, second))
@@ -66,13 +75,13 @@ def walk(first: np.ndarray, second: np.ndarray, *, path: str, pace: str) -> Walk
         tau = np.tile(time if pace == "even" else time**3 * (10 - 15 * time + 6 * time**2), (len(first), 1))
     if path == "sphere":
         ends = q1, length1, q2, length2, first[:, 0], second[:, 0]
-        return Walk(np.asarray(augment.transition(*ends, tau, frames=frames)), tau)
+        return PeakTransitions(np.asarray(augment.transition(*ends, tau, frames=frames)), tau)
     share = tau[..., None, None]
-    return Walk((1 - share) * first[:, None, -1] + share * second[:, None, -1], tau)
+    return PeakTransitions((1 - share) * first[:, None, -1] + share * second[:, None, -1], tau)
 
 
-def again(data: dataset.Dataset, found: motions.Motions, *, take: int = 1) -> motions.Motions:
-    """Direct transitions performed by the same people once more. They are not in the dataset: it has take 0."""
+def perform_again(data: dataset.Dataset, found: motions.Motions, *, take: int = 1) -> motions.Motions:
+    """Return another take of the direct transitions by the same people; the dataset holds take 0 alone."""
     spec = data.index["spec"]
     curves = np.zeros_like(found.curves)
     for person in np.unique(found.subject):
@@ -86,40 +95,24 @@ def again(data: dataset.Dataset, found: motions.Motions, *, take: int = 1) -> mo
     return found._replace(curves=curves)
 
 
-def name(way: tuple[str, str]) -> str:
-    """As tables call it."""
+def variant_name(way: tuple[str, str]) -> str:
+    """Return the name of a variant in tables and results."""
     return ", ".join(way)
 
 
-def profile(curves: np.ndarray) -> np.ndarray:
-    """Speed at each step over the mean speed, (K, T-1)."""
-    speed = np.linalg.norm(np.diff(curves, axis=1), axis=-1).mean(axis=-1)
-    return speed / speed.mean(axis=1, keepdims=True)
+def compare_with_direct(made: PeakTransitions, direct: motions.Motions, scale: float) -> dict[str, Any]:
+    """Compare K transitions with the directly performed ones between the same peaks.
 
-
-def detour(curves: np.ndarray) -> np.ndarray:
-    """Length of the path over the distance of its ends, (K,); 1: straight."""
-    steps = np.linalg.norm(np.diff(curves, axis=1), axis=(-2, -1)).sum(axis=1)
-    return steps / np.linalg.norm(curves[:, -1] - curves[:, 0], axis=(-2, -1))
-
-
-def halfway(curves: np.ndarray) -> np.ndarray:
-    """How far from neutral the face is when half of the path is done, (K,), in mean distance of a landmark."""
-    covered = np.cumsum(np.linalg.norm(np.diff(curves, axis=1), axis=(-2, -1)), axis=1)
-    frame = 1 + np.argmin(np.abs(covered / covered[:, -1:] - 0.5), axis=1)
-    return np.linalg.norm(curves[np.arange(len(curves)), frame], axis=-1).mean(axis=-1)
-
-
-def against(made: Walk, direct: motions.Motions, scale: float) -> dict[str, Any]:
-    """How near K motions are to directly performed ones between the same peaks.
-
-    "aligned": moved so that both ends agree with the direct ones', in proportion to the way gone. Ratios: of means.
+    "aligned" distances are those after a correction, linear in the covered fraction of the path, that makes both ends
+    agree. Ratios are ratios of means.
     """
     left = 1 - made.tau[..., None, None]
     first, last = (direct.curves[:, [k]] - made.curves[:, [k]] for k in (0, -1))
     aligned = made.curves + left * first + (1 - left) * last
-    away, away_aligned = (_away(curves, direct.curves) * scale for curves in (made.curves, aligned))
-    off = profile(made.curves) - profile(direct.curves)
+    away, away_aligned = (
+        motion_metrics.mean_distance(curves, direct.curves) * scale for curves in (made.curves, aligned)
+    )
+    off = motion_metrics.speed_profile(made.curves) - motion_metrics.speed_profile(direct.curves)
     ends = np.linalg.norm(np.concatenate([first, last]), axis=-1).mean() * scale
     return {
         "distance_mm": float(away.mean()),
@@ -127,16 +120,21 @@ def against(made: Walk, direct: motions.Motions, scale: float) -> dict[str, Any]
         "ends_mm": float(ends),
         "each_aligned_mm": away_aligned,
         "speed_rms": float(np.sqrt((off**2).mean(axis=1)).mean()),
-        "acceleration_ratio": _ratio(_acceleration, made.curves, direct.curves),
-        "detour": float(detour(made.curves).mean()),
-        "detour_ratio": _ratio(detour, made.curves, direct.curves),
-        "halfway_ratio": _ratio(halfway, made.curves, direct.curves),
-        "profile": profile(made.curves).mean(axis=0),
+        "acceleration_ratio": motion_metrics.ratio_of_means(motion_metrics.acceleration, made.curves, direct.curves),
+        "detour": float(motion_metrics.detour(made.curves).mean()),
+        "detour_ratio": motion_metrics.ratio_of_means(motion_metrics.detour, made.curves, direct.curves),
+        "halfway_ratio": motion_metrics.ratio_of_means(
+            motion_metrics.displacement_at_half_path, made.curves, direct.curves
+        ),
+        "profile": motion_metrics.speed_profile(made.curves).mean(axis=0),
     }
 
 
-def pairs_between(onsets: motions.Motions, count: int, seed: int) -> dict[str, np.ndarray]:
-    """Index pairs (E * count, 2) of two people's onsets, `count` for each first expression, by what the second is."""
+def draw_pairs(onsets: motions.Motions, count: int, seed: int) -> dict[str, np.ndarray]:
+    """Draw index pairs (E * count, 2) of two people's onsets, `count` for each expression of the first one.
+
+    Returned by kind: "same expression" and "two expressions".
+    """
     random = np.random.default_rng(seed)
     drawn: dict[str, list] = {"same expression": [], "two expressions": []}
     for label in np.unique(onsets.end):
@@ -147,32 +145,34 @@ def pairs_between(onsets: motions.Motions, count: int, seed: int) -> dict[str, n
     return {kind: np.array(rows) for kind, rows in drawn.items()}
 
 
-def cleanness(
+def interpolation_scores(
     onsets: motions.Motions, noisy: np.ndarray, pairs: np.ndarray, path: str, pool: motions.Motions | None, scale: float
 ) -> dict[str, np.ndarray]:
-    """How motions between two people's keep what the two have, and how far noise moves them, (tau, K) each.
+    """Compare interpolated motions with the two motions they are made of, (TAUS, K) each.
 
-    `noisy`: the onsets' curves with noise. With a pool of other people's onsets, also how near they are to real ones.
+    Ratios are to the geometric mean of the two, weighted by tau. `noisy` holds the onsets with noise added: "noise_mm"
+    is the distance that the noise moves the interpolated motion. With a `pool` of other people's onsets, also the
+    distance to the nearest real motion.
     """
     rows = []
     for tau in TAUS:
         first, second = (onsets.curves[column] for column in pairs.T)
-        made = np.asarray(between(first, second, tau, path=path))
+        made = np.asarray(interpolate(first, second, tau, path=path))
         row = {
             f"{name}_ratio": measure(made) / (measure(first) ** (1 - tau) * measure(second) ** tau)
-            for name, measure in (("length", _length), ("peak", _peak), ("acceleration", _acceleration))
+            for name, measure in _MEASURES.items()
         }
         row["jitter_ratio"] = row["acceleration_ratio"] / row["length_ratio"]
-        moved = np.asarray(between(*(noisy[column] for column in pairs.T), tau, path=path))
-        row["noise_mm"] = scale * _away(moved, made)
+        moved = np.asarray(interpolate(*(noisy[column] for column in pairs.T), tau, path=path))
+        row["noise_mm"] = scale * motion_metrics.mean_distance(moved, made)
         if pool is not None:
-            row |= nearest(made, onsets.end[pairs[:, 0]], pool, scale)
+            row |= nearest_real(made, onsets.end[pairs[:, 0]], pool, scale)
         rows.append(row)
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-def nearest(curves: np.ndarray, labels: np.ndarray, pool: motions.Motions, scale: float) -> dict[str, np.ndarray]:
-    """The distance (K,) to the nearest motion of the same label in the pool: in mm, and as an angle on the sphere."""
+def nearest_real(curves: np.ndarray, labels: np.ndarray, pool: motions.Motions, scale: float) -> dict[str, np.ndarray]:
+    """Return the distance (K,) to the nearest pool motion of the same label, in mm and as an angle on the sphere."""
     found = {"nearest_mm": np.zeros(len(curves)), "nearest_angle": np.zeros(len(curves))}
     for label in np.unique(labels):
         mine, known = curves[labels == label], pool.curves[pool.end == label]
@@ -181,24 +181,3 @@ def nearest(curves: np.ndarray, labels: np.ndarray, pool: motions.Motions, scale
         cosine = q @ p.T / (curves.shape[1] - 1)
         found["nearest_angle"][labels == label] = np.arccos(np.clip(cosine, -1, 1)).min(axis=1)
     return found
-
-
-def _length(curves: np.ndarray) -> np.ndarray:
-    return np.asarray(srvf.length(jnp.asarray(curves)))
-
-
-def _peak(curves: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(curves[:, -1], axis=(-2, -1))
-
-
-def _acceleration(curves: np.ndarray) -> np.ndarray:
-    return np.asarray(metrics.acceleration(jnp.asarray(curves)))
-
-
-def _away(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Mean distance (K,) of a landmark."""
-    return np.linalg.norm(a - b, axis=-1).mean(axis=(1, 2))
-
-
-def _ratio(measure, a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.mean(measure(a)) / np.mean(measure(b)))

@@ -1,4 +1,4 @@
-"""What `experiments.expression_lstm` shows of its scores: tables, bars, and the faces themselves."""
+"""Tables, bar charts and rendered faces of `experiments.expression_lstm`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from facejax.viz import eyes_teeth, render
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-PREFIX = 10  # true frames that are given
-SHOWN, FRAMES, PICTURE = 107, 8, (170, 212)  # a test subject, pictures of a sequence, pixels
+PREFIX = 10  # true frames given to the network
+SHOWN, FRAMES, PICTURE = 107, 8, (170, 212)  # test subject of the sheet, frames per sequence, pixels
 
 
-def ratios(row: dict[str, float]) -> dict[str, float]:
-    """What is asked of the networks, each against its strongest rival."""
+def error_ratios(row: dict[str, float]) -> dict[str, float]:
+    """Return the errors over the strongest baseline's, and motion energy and acceleration over real motion."""
     return {
         "next": row["next_network"] / min(row["next_velocity"], row["next_mean"]),
         "rest": row["rest_network"] / min(row["rest_velocity"], row["rest_mean"], row["rest_mean_steps"]),
@@ -32,10 +32,10 @@ def ratios(row: dict[str, float]) -> dict[str, float]:
 
 
 def variants_table(table: dict[str, dict], seconds: dict[str, float]) -> str:
-    """Every way of training: errors over the strongest rival's, motion over real motion."""
+    """Return the Markdown table of all training variants, means and ranges over expressions."""
     rows = []
     for name, found in table.items():
-        each = [ratios(row) for row in found.values()]
+        each = [error_ratios(row) for row in found.values()]
         means = [float(np.mean([ratio[key] for ratio in each])) for key in ("next", "rest", "whole")]
         spans = ["{:.2f} to {:.2f}".format(*_span([r[key] for r in each])) for key in ("energy", "acceleration")]
         rows.append((name, *means, f"{max(ratio['whole'] for ratio in each):.3f}", *spans, f"{seconds[name]:.0f}"))
@@ -50,7 +50,7 @@ def variants_table(table: dict[str, dict], seconds: dict[str, float]) -> str:
 
 
 def test_table(judged: dict[str, dict]) -> str:
-    """Each emotion in millimetres, beside every rival."""
+    """Return the Markdown table of errors per expression in millimetres, beside all baselines."""
     rows = []
     for label, row in judged.items():
         rows.append(
@@ -58,7 +58,7 @@ def test_table(judged: dict[str, dict]) -> str:
                 label,
                 *("{next_network:.3f} / {next_velocity:.3f} / {next_mean:.3f}".format(**row),),
                 "{rest_network:.2f} / {rest_velocity:.2f} / {rest_mean:.2f} / {rest_mean_steps:.2f}".format(**row),
-                "{whole_network:.3f} / {whole_mean:.3f} = {ratio:.3f}".format(**row, ratio=ratios(row)["whole"]),
+                "{whole_network:.3f} / {whole_mean:.3f} = {ratio:.3f}".format(**row, ratio=error_ratios(row)["whole"]),
                 "{energy:.2f} ({energy_mean:.2f})".format(**row),
                 "{acceleration:.2f} ({acceleration_mean:.2f})".format(**row),
             )
@@ -76,7 +76,7 @@ def _span(values) -> tuple[float, float]:
 
 
 def plot(path: Path, judged: dict[str, dict]) -> Path:
-    """The same as bars."""
+    """Plot the errors per expression as bars."""
     figure, axes = plt.subplots(1, 3, figsize=(13, 3.8), constrained_layout=True)
     colours = ("#6a9a58", "#c46b4e", "#5b8db8", "#9a86b0")
     kinds = (
@@ -101,16 +101,13 @@ def plot(path: Path, judged: dict[str, dict]) -> Path:
     axes[2].set_xticks(range(len(judged)), list(judged), rotation=30)
     axes[2].set_title("motion from the neutral face, over real")
     axes[2].legend(frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _run.save_figure(figure, path)
 
 
 def sheet(path: Path, networks: expressions.Expressions, data: dataset.Dataset | None = None) -> None:
-    """Each network's own expression on one unseen face, by radial basis functions; SL21, Fig. 5.
+    """Render each network's expression on one unseen face, warped by radial basis functions (SL21, figure 5).
 
-    A MakeHuman face, or the last one of a dataset.
+    The face is a MakeHuman test subject, or the last subject of a dataset.
     """
     shape = makehuman.template()
     faces, index, rest = shape.faces, shape.landmarks, shape.vertices

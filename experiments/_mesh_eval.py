@@ -1,7 +1,7 @@
-"""What the experiments on landmarks -> mesh share: methods fitted to cases, and results that are kept.
+"""Fitting and evaluation of the landmark-to-mesh methods on cases, with results cached on disk.
 
-A *case* is one fold of one protocol (`experiments._cases`). A method's distances on a case are kept in its folder, so
-that a comparison that was stopped goes on, and one method can be added later.
+A *case* is one fold of one protocol (`experiments._datasets`). The vertex distances of a method on a case are cached
+in its folder, so that an interrupted comparison can be resumed and methods can be added later.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from facejax.training import metric_logger
 from facejax.training.recipes import fit_neural3dmm, fit_residual, fit_s2d_dec
 
 QUICK_STEPS, QUICK_COMPONENTS = 100, 60
-NAMES = {
+METHOD_NAMES = {
     "s2d": "S2D-Dec",
     "s2d_residual": "residual decoder",
     "gpmm": "carried GPMM (its base)",
@@ -42,30 +42,30 @@ NAMES = {
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Of every experiment on landmarks -> mesh."""
+    """Options of every experiment on landmarks to mesh."""
 
     out: Path = Path("runs")
     """Folder for checkpoints and results."""
     seed: int = 0
-    """Of the networks."""
+    """Seed of the networks."""
     quick: bool = False
-    """A look: small datasets and few steps."""
+    """Use small datasets and few training steps, to try the experiment out."""
     paper: bool = False
-    """Train for the paper's 300 epochs."""
+    """Train for the 300 epochs of OT23."""
     publish: bool = False
-    """Also write the figures that the README quotes."""
+    """Also write the committed results in experiments/results."""
     trained_on: str = ""
-    """For the record: the machine that trained the checkpoints in the folder, where it is not this one."""
+    """Name of the machine that trained the checkpoints in the folder, recorded where it is not this one."""
 
     @property
     def mode(self) -> Mode:
-        """How thorough. Raises `ValueError` where two are asked for."""
+        """Return the training length. Raises `ValueError` where both --quick and --paper are given."""
         if self.quick and self.paper:
-            raise ValueError("--quick and --paper: name one of them")
+            raise ValueError("--quick and --paper exclude each other")
         return "quick" if self.quick else "paper" if self.paper else "default"
 
     def folder(self, out: Path | None = None) -> Path:
-        """Where checkpoints lie: a look and the real thing, or two datasets, do not go on from one another."""
+        """Return the folder for checkpoints, one per mode and per dataset, so that runs do not mix."""
         out = self.out if out is None else out
         if (data := getattr(self, "data", None)) is not None:
             out = out / f"{data.name}-{hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:8]}"
@@ -73,30 +73,35 @@ class Options:
 
 
 class Result(NamedTuple):
-    """A method on a case."""
+    """The result of a method on a case."""
 
     distances: vertex_error.Distances
-    seconds: float  # of fitting, however often it was stopped
-    about: dict[str, Any]  # what was chosen
+    seconds: float  # of fitting, over all interrupted runs
+    about: dict[str, Any]  # hyperparameters that were chosen, training steps
 
 
-def options_of(case: Case, mode: Mode, seed: int, hierarchy: hierarchy.Hierarchy, **plans) -> baselines.Options:
-    """Steps of training by mode: a look, two hours at most for one method and split, or the paper's 300 epochs."""
+def training_options(case: Case, mode: Mode, seed: int, hierarchy: hierarchy.Hierarchy, **plans) -> baselines.Options:
+    """Return the fitting options of a case: default training lengths, `QUICK_STEPS`, or the 300 epochs of OT23.
+
+    `plans` replaces fields of the options.
+    """
     options = baselines.Options(by=case.by, seed=seed, hierarchy=hierarchy)
     if mode == "default":
         return options._replace(**plans)
     epochs = 300 * case.train.count
-    steps = {
-        "decoder": fit_s2d_dec.S2DDecPlan, "residual": fit_residual.ResidualPlan, "neural3dmm": fit_neural3dmm.Neural3DMMPlan,
-    }  # fmt: skip
-    for name, plan in steps.items():
+    plans_by_name = {
+        "decoder": fit_s2d_dec.S2DDecPlan,
+        "residual": fit_residual.ResidualPlan,
+        "neural3dmm": fit_neural3dmm.Neural3DMMPlan,
+    }
+    for name, plan in plans_by_name.items():
         chosen = plan()
         count = QUICK_STEPS if mode == "quick" else -(-epochs // chosen.batch)
         options = options._replace(**{name: chosen._replace(steps=count)})
     return (options._replace(components=QUICK_COMPONENTS) if mode == "quick" else options)._replace(**plans)
 
 
-def judge(
+def evaluate(
     name: str,
     case: Case,
     folder: Path,
@@ -106,23 +111,23 @@ def judge(
     noises: Sequence[float] = (0.0,),
     trained: str | None = None,
 ) -> dict[float, Result]:
-    """Fit a method to a case and measure it under each landmark noise (mm), or read what was measured before.
+    """Fit a method to a case and evaluate it under each landmark noise sigma (mm), or read the cached result.
 
-    `trained` names the folder of checkpoints, where cases with the same training meshes share one.
+    `trained` names the folder of checkpoints where cases with the same training meshes share one.
     """
     kept = folder / name / case.name
-    return remembered(
+    return cached(
         kept,
-        key(name, case, options, noises),
+        cache_key(name, case, options, noises),
         noises,
         lambda: _measured(name, case, kept if trained is None else folder / name / trained, options, regions, noises),
     )
 
 
-def remembered(
+def cached(
     folder: Path, key: str, noises: Sequence[float], measure: Callable[[], dict[float, Result]]
 ) -> dict[float, Result]:
-    """What was measured before under this key, else measured now and kept in the folder."""
+    """Return the result cached in the folder under this key, else measure and cache it."""
     known = _read(folder, key, noises)
     if known is None:
         known = measure()
@@ -141,16 +146,16 @@ def _measured(name, case, folder, options, regions, noises) -> dict[float, Resul
     return found
 
 
-def fitted(name: str, case: Case, folder: Path, options: baselines.Options) -> Any:
-    """A method's parameters for a case: what was trained step by step in the folder of `judge` is not trained again."""
+def fit_method(name: str, case: Case, folder: Path, options: baselines.Options) -> Any:
+    """Return a method's parameters for a case; networks resume from the checkpoints of `evaluate`."""
     return _fit(name, case, folder / name / case.name, options)[0]
 
 
 def _fit(name: str, case: Case, folder: Path, options: baselines.Options) -> tuple[Any, float]:
-    """Parameters, and the seconds that they took; of networks those of their steps, however often they were stopped."""
+    """Return the parameters and the seconds of fitting; for networks, of the training steps over all runs."""
     begun = time.perf_counter()
     if name in ("gpmm", "gpmm_found", "s2d_residual"):
-        options = options._replace(base=base(case, options))
+        options = options._replace(base=fit_base(case, options))
     model = baselines.METHODS[name].fit(case.train, folder, options)
     steps = [entry["seconds"] for entry in metric_logger.read(folder)]
     return model, sum(steps) if steps else time.perf_counter() - begun
@@ -159,9 +164,9 @@ def _fit(name: str, case: Case, folder: Path, options: baselines.Options) -> tup
 _known_bases: dict[str, Any] = {}
 
 
-def base(case: Case, options: baselines.Options):
-    """The morphable model of a case, which two methods share: the last one is kept, so judge one after the other."""
-    facts = key("gpmm", case, options, ())
+def fit_base(case: Case, options: baselines.Options):
+    """Return the GPMM of a case, which several methods share; the last one is cached in memory."""
+    facts = cache_key("gpmm", case, options, ())
     if facts not in _known_bases:
         _known_bases.clear()
         _known_bases[facts] = baselines.METHODS["gpmm"].fit(case.train, Path(), options)
@@ -178,8 +183,8 @@ def _about(name: str, model: Any, options: baselines.Options) -> dict[str, Any]:
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 
-def key(name: str, case: Case, options: baselines.Options, noises: Sequence[float]) -> str:
-    """What a kept result depends on, as a hash."""
+def cache_key(name: str, case: Case, options: baselines.Options, noises: Sequence[float]) -> str:
+    """Return a hash of everything that a cached result depends on."""
     plans = {
         "s2d": [options.decoder], "neural3dmm": [options.neural3dmm], "gpmm": [options.components],
         "gpmm_found": [options.components], "s2d_residual": [options.residual, options.components],
@@ -187,7 +192,7 @@ def key(name: str, case: Case, options: baselines.Options, noises: Sequence[floa
     facts = [name, plans, options.by, options.seed, dict(case.train.data.index["spec"]), sorted(noises)]
     digest = hashlib.sha256(repr(facts).encode())
     for meshes in (case.train, case.test):
-        digest.update(repr(dict(meshes.data.index["spec"])).encode() + meshes.at.tobytes())
+        digest.update(repr(dict(meshes.data.index["spec"])).encode() + meshes.indices.tobytes())
     return digest.hexdigest()
 
 
@@ -217,27 +222,16 @@ def _read(folder: Path, key: str, noises: Sequence[float]) -> dict[float, Result
         return None
 
 
-def pooled(results: Sequence[Result]) -> vertex_error.Distances:
-    """The distances of all folds together."""
+def pool(results: Sequence[Result]) -> vertex_error.Distances:
+    """Pool the distances of all folds."""
     total = results[0].distances
     for result in results[1:]:
         total = total.add(result.distances)
     return total
 
 
-def drawn(figure: Any, path: Path) -> Path:
-    """Write a matplotlib figure and let go of it."""
-    from matplotlib import pyplot
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic.replace_file(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    pyplot.close(figure)
-    return path
-
-
 def check_methods(names: Sequence[str]) -> None:
-    """Raise `ValueError` for a method that there is not."""
+    """Raise `ValueError` for the name of an unknown method."""
     for name in names:
         if name not in baselines.METHODS:
             raise ValueError(f"unknown method {name!r}, expected some of {', '.join(baselines.METHODS)}")

@@ -1,7 +1,7 @@
-"""The page of `experiments.user_study`, the files that come back from it, and what they say.
+"""Web page, answer files and statistics of `experiments.user_study`.
 
-The page and the participants' files know an item by an opaque name; `items.json` alone knows its kind: "composed",
-"peak" (neutral → peak), "predecessor" (neutral → peak by another generator) or "real".
+The page and the participants' CSV files identify an item by an opaque name; only `items.json` holds its kind:
+"composed", "peak" (neutral → peak), "predecessor" (neutral → peak by another generator) or "real".
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TEMPLATE = Path(__file__).with_name("_study.html")
 HEADER = ("participant", "seed", "version", "order", "item", "labels", "nat", "lab", "seconds")
 SCORES = ("nat", "lab")
 GROUPS = {"ours": ("composed", "peak"), **{kind: (kind,) for kind in ("composed", "peak", "predecessor", "real")}}
-# OT23, 4.4. Its 28 animations are taken to be those of the proposed model.
+# OT23, section 4.4; its 28 animations are assumed to be those of the proposed model.
 PAPER = {"ours": {"nat": 7.22, "lab": 7.05}, "peak": {"nat": 7.39}, "predecessor": {"nat": 5.82}}
 PAPER_PARTICIPANTS = 23
 NAMES = {
@@ -38,7 +38,7 @@ NAMES = {
 
 
 class Film(NamedTuple):
-    """One animation as the page shows it."""
+    """One animation on the page."""
 
     name: str  # opaque
     labels: tuple[str, ...]
@@ -48,7 +48,7 @@ class Film(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """One participant's scores of one item."""
+    """The scores of one participant for one item."""
 
     participant: str
     kind: str
@@ -57,10 +57,10 @@ class Answer(NamedTuple):
 
 
 def write_page(path: Path, items: Sequence[Film], high: Film, low: Film) -> str:
-    """Write the page, pictures inside, `high` and `low` being the examples of 10 and 0; returns its version.
+    """Write the page with all pictures embedded and return its version.
 
-    Items lie in the order of their names, which says nothing about them. The version stands for every picture and
-    every word.
+    `high` and `low` are the examples of the scores 10 and 0. Items are sorted by their opaque names. The version is a
+    hash of all pictures and all text.
     """
     items = sorted(items)
     template = TEMPLATE.read_text("utf-8")
@@ -69,7 +69,7 @@ def write_page(path: Path, items: Sequence[Film], high: Film, low: Film) -> str:
     examples = {"high": _film(high), "low": _film(low)}
     study = {"version": version, "items": [_film(film) for film in items], "examples": examples}
     text = string.Template(template).substitute(
-        # Inside a script element only "<" could end it or open a comment.
+        # Inside a script element only "<" could close the element or open a comment.
         study=json.dumps(study).replace("<", "\\u003c"),
         header=json.dumps(HEADER),
         width=f"{high.size[0]}px",
@@ -85,21 +85,22 @@ def _film(film: Film) -> dict[str, Any]:
 
 
 def read_items(path: Path) -> dict[str, Any]:
-    """`items.json`. Raises `ValueError` if it is missing or damaged."""
+    """Read `items.json`. Raises `ValueError` if it is missing or damaged."""
     try:
         study = json.loads(path.read_text("utf-8"))
         whole = {"version", "items", "weights", "made"} <= set(study) and "dataset" in study["made"]
         if not whole or not all({"kind", "labels"} <= set(item) for item in study["items"].values()):
             raise ValueError("version, items, kind, labels, weights or made is missing")
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} cannot be read ({error}): it is written with the page that was answered") from error
+        raise ValueError(f"{path} cannot be read ({error}): give the items.json written with the page") from error
     return study
 
 
 def read_scores(paths: Sequence[Path], study: dict[str, Any]) -> list[Answer]:
-    """The answers in files, or in folders of them.
+    """Read the answers from CSV files, or from folders of them.
 
-    Raises `ValueError`, naming file, line and field, for anything that the page would not have written.
+    Raises:
+        ValueError: with file, line and field, for content that the page does not write.
     """
     files = [file for path in paths for file in (sorted(path.glob("*.csv")) if path.is_dir() else [path])]
     if not files:
@@ -124,7 +125,7 @@ def read_scores(paths: Sequence[Path], study: dict[str, Any]) -> list[Answer]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Line numbers and rows; a byte order mark is forgiven."""
+    """Yield line numbers and rows; a byte order mark is allowed."""
     try:
         lines = csv.reader(path.read_text("utf-8-sig").splitlines(), strict=True)
         header = next(lines, [])
@@ -166,11 +167,11 @@ def _refuse(path: Path, line: int, field: str, expected: str, got: str) -> None:
 
 
 def summary(answers: Sequence[Answer]) -> dict[str, Any]:
-    """Mean and standard deviation of the ratings, and the 95 % interval of the mean over participants."""
+    """Return mean, standard deviation and the 95 % confidence interval of the mean over participants."""
     people = sorted({answer.participant for answer in answers})
     groups, means = {}, {}
     for group, kinds in GROUPS.items():
-        # A group is complete or not shown: "ours" without one of its two halves would be another mean.
+        # Incomplete groups are left out: "ours" without one of its two kinds would be a different mean.
         chosen = [answer for answer in answers if answer.kind in kinds]
         if {answer.kind for answer in chosen} != set(kinds):
             continue
@@ -183,14 +184,14 @@ def summary(answers: Sequence[Answer]) -> dict[str, Any]:
             groups[group][name] = {"mean": float(values.mean()), "std": spread, "interval": interval(mean)}
     found = {"participants": len(people), "ratings": len(answers), "groups": groups}
     if {"peak", "predecessor"} <= set(groups):
-        # The same labels on the same faces, seen by the same people: their differences tell more than two means.
+        # Same labels, faces and participants: paired differences have a narrower interval than two means.
         gain = {name: means["peak", name] - means["predecessor", name] for name in SCORES}
         found["gain"] = {name: {"mean": float(x.mean()), "interval": interval(x)} for name, x in gain.items()}
     return found
 
 
 def interval(values: np.ndarray) -> list[float] | None:
-    """The 95 % interval of the mean of independent values (n,), by Student's t; none of fewer than two."""
+    """Return the 95 % confidence interval of the mean of values (n,) by Student's t; None for fewer than two values."""
     if len(values) < 2:
         return None
     half = float(stats.t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
@@ -198,7 +199,7 @@ def interval(values: np.ndarray) -> list[float] | None:
 
 
 def table(found: dict[str, Any]) -> str:
-    """Markdown of a `summary`."""
+    """Return a `summary` as Markdown."""
     rows = []
     for group, row in found["groups"].items():
         cells = [_cell(row[name]) for name in SCORES]

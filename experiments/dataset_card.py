@@ -1,13 +1,14 @@
-"""What is in makehuman4d, and how far from linear is it?
+"""Contents of makehuman4d, and the error of linear maps on it by realism level.
 
-Counts; a histogram of landmark speed; a contact sheet of 18 expressions on 5 subjects at the apex, and of one
-subject on all four levels of realism; and per level, on held-out subjects and on held-out expressions, the vertex
-error of ridge regression and PCA-220 from the same 68 landmarks. A linear map is exact on level 0 by construction:
-the ladder says by how much it fails above.
+Counts, a histogram of landmark speed, a contact sheet of 18 expressions on 5 subjects at the apex and one of a
+subject on all four realism levels; per level, on held-out subjects and on held-out expressions, the vertex error of
+ridge regression and PCA-220 from the same 68 landmarks. A linear map is exact on held-out subjects of level 0 by
+construction; its error on the other levels measures their nonlinearity.
 
     python -m experiments.dataset_card --publish
 
-About 12 minutes on 2 cores, once the four levels are prepared (5 minutes more).
+Expected, ridge on held-out subjects, head: 0.0000, 0.0004, 0.0411 and 0.0462 mm on levels 0 to 3. Time: 11 minutes on
+2 cores of an Intel Xeon, once the four levels are prepared (5 minutes more).
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from facejax.data.mesh_subset import of_split
 from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d, performance, rig
 from facejax.evaluation import vertex_error
 from facejax.inference import makehuman_portrait
-from facejax.io import atomic
 from facejax.models.decoders import linear
 from facejax.training.recipes import fit_linear
 from facejax.viz import render
@@ -43,21 +43,21 @@ class Config:
     out: Path = Path("runs/dataset_card")
     """Folder for the results."""
     seed: int = makehuman4d.SEED
-    """Of the dataset."""
+    """Seed of makehuman4d."""
     data: Path | None = None
     """A prepared dataset to describe in place of makehuman4d and its levels."""
     levels: tuple[int, ...] = rig.LEVELS
-    """Levels of realism to describe."""
+    """Realism levels to describe."""
     subjects: int = 120
-    """Of the dataset."""
+    """Number of subjects of makehuman4d."""
     meshes: int = 20_000
-    """Of the dataset."""
+    """Number of meshes of makehuman4d."""
     publish: bool = False
-    """Also write the figures that the README quotes."""
+    """Also write the committed results in experiments/results."""
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Describe every level."""
+    """Describe every level and draw the sheets."""
     begun = time.perf_counter()
     levels, histogram = {}, None
     for level in config.levels if config.data is None else [config.data.name]:
@@ -71,13 +71,12 @@ def run(config: Config) -> dict[str, Any]:
     figure = _plot(config.out / "dataset_card.png", levels, histogram)
     if config.data is None:
         _sheet(config.out / "expressions.png", config)
-        _ladder(config.out / "levels.png", config)
+        _levels_sheet(config.out / "levels.png", config)
     else:
-        _farthest(config.out / "expressions.png", data)
+        _peaks_sheet(config.out / "expressions.png", data)
     if config.publish and config.data is None:
         for name in ("expressions", "levels"):
-            with atomic.replace_file(_run.RESULTS / f"dataset_card_{name}.png") as temporary:
-                temporary.write_bytes((config.out / f"{name}.png").read_bytes())
+            _run.publish_file(config.out / f"{name}.png", f"dataset_card_{name}.png")
     metrics = {"levels": levels, "speed_mm_per_s": _quantiles(histogram)}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=data.index["spec"])
     _run.finish("dataset_card", config, metrics, made=made, table=_table(levels), figure=figure)
@@ -88,7 +87,7 @@ def _counts(data: dataset.Dataset) -> dict[str, Any]:
     direct = sum(">" in s.label for s in data.sequences)
     at, owner = data.meshes("test")
     moved = np.linalg.norm(data.vertices[at] - data.neutral[owner], axis=-1)
-    mask = _datasets.regions_of(data)["face"]
+    mask = _datasets.region_masks(data)["face"]
     return {
         "subjects": {split: len(data.subjects(split)) for split in dataset.SPLITS},
         "sequences": len(data.sequences) - direct,
@@ -101,8 +100,8 @@ def _counts(data: dataset.Dataset) -> dict[str, Any]:
 
 
 def _linear_errors(data: dataset.Dataset) -> dict[str, Any]:
-    """Ridge and PCA-220 on test subjects: fitted to all expressions, or judged on a fourth of them that is unseen."""
-    regions = _datasets.regions_of(data)
+    """Return errors of ridge and PCA-220 on test subjects: on seen expressions, and on unseen ones in four folds."""
+    regions = _datasets.region_masks(data)
     train, test = of_split(data, "train"), of_split(data, "test")
     splits = {"subjects": [(train, test)], "expressions": []}
     names = expression_recipes.COMA if _datasets.is_makehuman(data) else sorted(set(test.labels))
@@ -123,7 +122,7 @@ def _linear_errors(data: dataset.Dataset) -> dict[str, Any]:
 
 
 def _speeds(data: dataset.Dataset) -> np.ndarray:
-    """Mean speed of the landmarks in mm/s, of every frame of every expression."""
+    """Return the mean speed of the landmarks in mm/s, of every frame of every expression."""
     speeds = []
     for s in data.sequences:
         if ">" not in s.label:
@@ -143,13 +142,11 @@ def _plot(path: Path, levels: dict[str, Any], speeds: np.ndarray) -> Path:
                 axis.plot(list(levels), values, style, marker="o", color=colour, label=f"{name}, {region}")
         axis.set(xlabel="realism level", ylabel="mm", title=f"Linear maps on held-out {split}")
     axes[2].legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _run.save_figure(figure, path)
 
 
 def _sheet(path: Path, config: Config) -> None:
-    """18 expressions at the apex on five subjects."""
+    """Render 18 expressions at the apex on five subjects."""
     rows = []
     for index in SHOWN:
         posed = rig.build(makehuman.subject(index, seed=config.seed), level=3)
@@ -167,8 +164,8 @@ def _sheet(path: Path, config: Config) -> None:
     render.save(path, np.concatenate(sheets))
 
 
-def _farthest(path: Path, data: dataset.Dataset) -> None:
-    """Of up to five people and nine labels of a dataset, the mesh that is farthest from neutral."""
+def _peaks_sheet(path: Path, data: dataset.Dataset) -> None:
+    """Render the mesh farthest from neutral of up to five people and nine labels of a dataset."""
     labels, at, faces = data.row_labels()[data.drawn], data.row_subjects()[data.drawn], np.asarray(data.faces)
     names, people = sorted(set(labels))[:9], np.unique(at)[:5]
     rows = []
@@ -186,8 +183,8 @@ def _farthest(path: Path, data: dataset.Dataset) -> None:
     render.save(path, render.contact_sheet(rows, row_labels=known, column_labels=names))
 
 
-def _ladder(path: Path, config: Config) -> None:
-    """Four expressions of one subject on every level, and at rest."""
+def _levels_sheet(path: Path, config: Config) -> None:
+    """Render neutral and five expressions of one subject on every level."""
     labels = ("neutral", "high_smile", "disgust", "mouth_extreme", "eyebrow", "mouth_up")
     weights = np.stack([performance.apex_weights(label, SHOWN[2], seed=config.seed) for label in labels])
     person = makehuman.subject(SHOWN[2], seed=config.seed)
@@ -197,7 +194,7 @@ def _ladder(path: Path, config: Config) -> None:
 
 
 def _portrait(vertices: np.ndarray) -> np.ndarray:
-    """A picture of a posed head (M, 3) with its own eyes and teeth."""
+    """Render a posed head (M, 3) with its own eyes and teeth."""
     shape = makehuman.template()
     camera = render.fit_camera(shape.vertices * 1.08, size=PICTURE, turn=18)
     skin, parts = vertices[None, : len(shape.vertices)], makehuman_portrait.parts(vertices[None])

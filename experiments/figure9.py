@@ -1,13 +1,17 @@
-"""Composed transitions, and motion carried from one face to another, as rendered meshes. OT23, figure 9.
+"""Composed transitions, and motion transferred from one face to another, as rendered meshes (OT23, figure 9).
 
     python -m experiments.figure9 --publish
     python -m experiments.figure9 --recording take.csv
     python -m experiments.figure9 --data STORE --model MODEL
 
-Above, two chains of transitions on unseen people. Below, the motion of one unseen person on two others: of a
-recording of Live Link Face where one is given, else a performance of makehuman4d; its landmarks go through their SRVF
-to the other face's neutral landmarks, and from there to its mesh. With `--data`, three people of a dataset, chains of
-its labels, and the first label that all three have recordings of. The films lie beside the picture.
+The upper rows show two chains of transitions on unseen people. The lower rows show the motion of one unseen person on
+two others: a recording of Live Link Face where one is given, else a performance of makehuman4d. Its landmarks are
+encoded as an SRVF, applied to the other face's neutral landmarks, and expanded to its mesh. With `--data`: three
+people of a dataset, chains of its labels, and the first label under which all three have recordings. Animations are
+written beside the picture as glTF.
+
+Expected errors of the transferred motion: 0.388 and 0.308 mm, of 1.276 and 1.126 mm of motion. Time: 20 seconds on 2
+cores of an AMD EPYC.
 """
 
 from __future__ import annotations
@@ -34,7 +38,7 @@ CHAINS = (
     ("neutral", "eyebrow", "high_smile", "mouth_extreme", "bareteeth", "neutral"),
 )
 PEOPLE = (103, 108, 114)
-PERFORMED = ("happiness", "mouth_extreme")  # one after the other, where no recording is given
+PERFORMED = ("happiness", "mouth_extreme")  # played one after the other where no recording is given
 SHOWN = 10
 PICTURE = (150, 188)
 
@@ -44,29 +48,29 @@ class Config:
     out: Path = Path("runs/figure9")
     """Folder for the results."""
     seed: int = 7
-    """Of the generated motion."""
+    """Seed of the generated motion."""
     model: Path | None = None
-    """Weights to use in place of the released ones."""
+    """Model file to use in place of the released models."""
     data: Path | None = None
-    """A prepared dataset, of which `--model` was made, in place of MakeHuman's people."""
+    """Prepared dataset that `--model` was trained on, to use in place of MakeHuman's people."""
     people: tuple[int, ...] = ()
-    """Numbers of the chains' two people, who are also the targets, and the source; by default 103, 108 and 114, of
-    MakeHuman's test subjects (100 to 119), or the first three of the
-    dataset's test, validation and training people."""
+    """Indices of three people: the two of the chains, who are also the targets, and the source. By default MakeHuman's
+    test subjects 103, 108 and 114 (of 100 to 119), or the first three of the dataset's test, validation and training
+    subjects."""
     recording: Path | None = None
-    """A recording of Live Link Face (CSV)."""
+    """CSV file of a recording by Epic's free iPhone app Live Link Face."""
     begin: float = 60.0
-    """Seconds into the recording."""
+    """Start of the passage in seconds."""
     seconds: float = 5.0
-    """How much of it."""
+    """Length of the passage in seconds."""
     publish: bool = False
-    """Also write the picture that the README shows."""
+    """Also write the committed results in experiments/results."""
 
 
 def run(config: Config) -> dict[str, Any]:
-    """The sheet, the films, and how far the transferred motion is from how the target itself moves."""
+    """Write the sheet and the animations; return the errors of the transferred motion against the target's own."""
     if config.data is not None and config.recording is not None:
-        raise ValueError("--recording moves MakeHuman's people, and --data brings its own: name one of them")
+        raise ValueError("--recording animates MakeHuman's people and --data uses its own: name one of them")
     begun, models = time.perf_counter(), pipeline.load(config.model)
     index = np.asarray(models.face.landmark_index)
     chains, takes = _stored(config, models) if config.data else (CHAINS, _performed(config, models))
@@ -83,16 +87,14 @@ def run(config: Config) -> dict[str, Any]:
     else:  # not every frame has a mesh
         films["source"] = source, np.asarray(pipeline.meshes(models, marks, source.rest)), marks
     labels.append("source")
-    errors, everywhere = [], np.ones(len(source.rest), bool)
+    errors = []
     for i, take in enumerate(targets):
-        marks = (take.rest[index] + _motion_transfer.onto(source, take, index)).astype(np.float32)
+        marks = (take.rest[index] + _motion_transfer.transfer(source, take, index)).astype(np.float32)
         vertices = np.asarray(pipeline.meshes(models, marks, take.rest))
         films[f"transfer{i + 1}"] = take, vertices, marks
         labels.append(f"on {take.name}")
         still = np.broadcast_to(take.rest, vertices.shape)
-        mean, at_rest = (
-            float(_motion_transfer.errors(made, take, everywhere, 0)[0].mean()) for made in (vertices, still)
-        )
+        mean, at_rest = (float(_mean_distance(made[take.at], take.vertices)) for made in (vertices, still))
         errors.append({"target": take.name, "mean_mm": mean, "still_mm": at_rest})
     outputs.make_output_folder(config.out)
     rows = []
@@ -110,8 +112,12 @@ def run(config: Config) -> dict[str, Any]:
     return metrics
 
 
+def _mean_distance(a: np.ndarray, b: np.ndarray) -> float:
+    return np.linalg.norm(a - b, axis=-1).mean(axis=1, dtype=np.float64).mean()
+
+
 def _performed(config: Config, models: pipeline.Models) -> list[_motion_transfer.Take]:
-    """Three of MakeHuman's people under the recording, or as the third of them performs."""
+    """Return the takes of three MakeHuman people, animated by the recording or by a performance of the third."""
     index = np.asarray(models.face.landmark_index)
     numbers = config.people or PEOPLE
     template, known = makehuman.template(), set(itertools.chain(*CHAINS))
@@ -123,25 +129,25 @@ def _performed(config: Config, models: pipeline.Models) -> list[_motion_transfer
     people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]
     if config.recording is not None:
         take = motion_sources.read_recording(config.recording, begin=config.begin, seconds=config.seconds)
-        return [_motion_transfer.posed(take, person, index) for person in people]
+        return [_motion_transfer.from_recording(take, person, index) for person in people]
     takes = [performance.perform(label, numbers[2], seed=makehuman4d.SEED).weights for label in PERFORMED]
     weights, found = np.concatenate(takes), []
     for person in people:
         skin = rig.pose(rig.build(person, level=motion_sources.LEVEL), weights)[:, : len(person.vertices)]
-        found.append(_motion_transfer.of_skin(skin, person, index))
+        found.append(_motion_transfer.from_meshes(skin, person, index))
     return found
 
 
 def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ...]], list[_motion_transfer.Take]]:
-    """Two chains of a dataset's labels, and one label's recordings of three people."""
+    """Return two chains of a dataset's labels, and three people's takes of one label."""
     data = dataset.open_meshes(config.data)
-    _motion_eval.fits(models, data, config.model or "the released models")
+    _motion_eval.check_models(models, data, config.model or "the released models")
     held = np.concatenate([data.subjects(split) for split in ("test", "validation", "train")])
     numbers = list(config.people or held[:3].tolist())
     if len(numbers) != 3 or not set(numbers) <= set(held.tolist()):
         raise ValueError(f"--people: expected three of {data.path}'s {len(held)} people, got {numbers}")
     for label in data.labels[1:]:
-        takes = [_motion_transfer.stored(data, number, label) for number in numbers]
+        takes = [_motion_transfer.find_recording(data, number, label) for number in numbers]
         if None not in takes:
             rng = np.random.default_rng(config.seed)
             names = [rng.permutation(data.labels[1:])[:4].tolist() for _ in CHAINS]

@@ -1,14 +1,15 @@
-"""Do generated motions move like real ones? Amplitude, jitter and diversity against held-out subjects.
+"""Amplitude, jitter and diversity of generated motions against held-out subjects.
 
-Amplitude: mean peak displacement of neutral -> expression, per expression, against the mean of 40 held-out subjects and
-against that of the training subjects: people differ, and the two real means by up to 16 %. Jitter: mean acceleration of
-the landmarks (second differences at 30 frames). Diversity: mean pairwise distance of samples of one pair, equal
-counts. All 342 ordered pairs of 18 expressions and neutral; real peak -> peak transitions are made like those that the
-generator learnt from, of held-out subjects, everybody meeting everybody.
+Amplitude: mean peak displacement of neutral to expression, per expression, over the mean of 40 held-out subjects and
+over that of the training subjects; the two real means differ by up to 16 %. Jitter: mean acceleration of the
+landmarks (second differences at 30 frames). Diversity: mean pairwise distance of samples of one pair, at equal
+counts. All 342 ordered pairs of 18 expressions and neutral. Real peak-to-peak transitions are built like those that
+the generator was trained on, from held-out subjects, combining every person with every other.
 
     python -m experiments.motion_quality --publish
 
-About 2 minutes on 2 cores.
+Expected ratios generated / real: amplitude 1.043 over all subjects, acceleration 1.007, diversity 0.986. Time: 90
+seconds on 2 cores of an AMD EPYC.
 """
 
 from __future__ import annotations
@@ -36,25 +37,25 @@ class Config:
     out: Path = Path("runs/motion_quality")
     """Folder for the results."""
     seed: int = 0
-    """Of the generator's noise."""
+    """Seed of the generator's noise."""
     data: Path | None = None
-    """A prepared dataset in place of makehuman4d."""
+    """Prepared dataset to use in place of makehuman4d."""
     level: int = 3
-    """Realism of makehuman4d."""
+    """Realism level of makehuman4d, 0 to 3."""
     samples: int = 64
-    """Generated motions of each pair."""
+    """Number of generated motions per pair."""
     model: Path | None = None
-    """Weights to judge in place of the released ones."""
+    """Model file to evaluate in place of the released models."""
     publish: bool = False
-    """Also write the figures that the README quotes."""
+    """Also write the committed results in experiments/results."""
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Generate every pair and compare it with real motions."""
+    """Generate motions of every pair and compare them with real ones."""
     begun = time.perf_counter()
-    data = _datasets.data_of(config.data, "default", level=config.level)
+    data = _datasets.load(config.data, "default", level=config.level)
     models = pipeline.load(config.model)
-    _motion_eval.fits(models, data, config.model or "the released models")
+    _motion_eval.check_models(models, data, config.model or "the released models")
     held_out = [split for split in ("validation", "test") if len(data.subjects(split))]
     real = motions.join(*(part for split in held_out for part in transitions.all_pairs(data, split, per_pair=20)))
     pairs = sorted(set(zip(real.start.tolist(), real.end.tolist(), strict=True)))
@@ -98,7 +99,7 @@ def run(config: Config) -> dict[str, Any]:
 
 
 def _peak(curves: np.ndarray) -> np.ndarray:
-    """Mean displacement of the landmarks in the last frame."""
+    """Return the mean displacement of the landmarks in the last frame."""
     return np.linalg.norm(curves[:, -1], axis=-1).mean()
 
 
@@ -150,11 +151,7 @@ def _plot(out: Path, found: dict[str, Any]) -> Path:
     right.axvline(1, color="k", linewidth=0.8)
     right.set_xlabel("generated / real, one count per pair of expressions")
     right.legend(frameon=False)
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / "motion_quality.png"
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return _run.save_figure(figure, out / "motion_quality.png")
 
 
 if __name__ == "__main__":

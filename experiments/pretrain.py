@@ -1,16 +1,19 @@
-"""Train the released models on makehuman4d: the generator of motion and the way from landmarks to meshes.
+"""Train the released models on makehuman4d: the motion generator and the landmark-to-mesh decoder.
 
     python -m experiments.pretrain --release
 
-Each stage keeps checkpoints in its folder and goes on from there when it was stopped; the two may run side by side
-(`--stage motion`, `--stage decoder`), and `--stage assemble --release` joins them into the package's
-`facejax/assets/makehuman4d.safetensors`, with the record of how it was made inside. Either network can come from a
-file of weights instead (`--motion FILE`, `--decoder FILE`). The way to meshes is the best linear answer, refined by a
-spiral decoder (`facejax.fit_residual`), or OT23's S2D-Dec (`--meshes-by s2d`).
+Each stage keeps checkpoints in its folder and resumes; the two may run side by side (`--stage motion`, `--stage
+decoder`), and `--stage assemble --release` joins them into the package's `facejax/assets/makehuman4d.safetensors`,
+with their provenance. Either network can come from a model file instead (`--motion FILE`, `--decoder FILE`). The
+decoder is the GPMM estimate plus residual decoder (`facejax.training.recipes.fit_residual`), or OT23's S2D-Dec
+(`--meshes-by s2d`).
 
-The generator of OT23's predecessor, which knows neutral -> peak alone, for `experiments.user_study`:
+The generator of OT23's predecessor, which is trained on neutral to peak alone, for `experiments.user_study`:
 
     python -m experiments.pretrain --onsets-only --decoder facejax/assets/makehuman4d.safetensors --out runs/predecessor
+
+Expected mean vertex error on the test subjects: 0.0219 mm over the head, 0.0272 mm over the face. Time: 21 minutes
+for the decoder and 5 for the generator on 2 cores of an AMD EPYC.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
+import facejax
 from experiments import _run
 from facejax.data import dataset, motions, transitions
 from facejax.data.mesh_subset import of_split
@@ -34,7 +38,7 @@ from facejax.models.decoders import s2d_dec
 from facejax.models.motion import generators
 from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual, fit_s2d_dec
 
-PACKAGED = Path(pipeline.__file__).parent / "assets" / bundle.RELEASED
+PACKAGED = Path(facejax.__file__).parent / "assets" / bundle.RELEASED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,39 +46,39 @@ class Config:
     out: Path = Path("runs/pretrain")
     """Folder for checkpoints, metrics and the weights."""
     seed: int = 0
-    """Of the initial weights, the order of the data and the noise."""
+    """Seed of the initial weights, the order of the data and the noise."""
     stage: Literal["all", "motion", "decoder", "assemble"] = "all"
-    """What to do; `assemble` needs the other two."""
+    """Stage to run; `assemble` needs the results of the other two."""
     level: int = 3
-    """Realism of the dataset."""
+    """Realism level of makehuman4d, 0 to 3."""
     subjects: int = 120
-    """Of the dataset."""
+    """Number of subjects of makehuman4d."""
     meshes: int = 20_000
-    """Of the dataset."""
+    """Number of meshes of makehuman4d."""
     generator: Literal["flow", "gan"] = "flow"
-    """Which generator of motion."""
+    """Kind of motion generator."""
     motion_steps: int | None = None
-    """Generator steps; by default those of its plan."""
+    """Number of training steps of the generator; by default that of its plan."""
     meshes_by: Literal["refined", "s2d"] = bundle.REFINED
-    """Way from landmarks to meshes: the best linear answer refined, or S2D-Dec."""
+    """Decoder from landmarks to meshes: GPMM estimate plus residual decoder, or S2D-Dec."""
     decoder_steps: int | None = None
-    """Steps of its network; by default those of its plan."""
+    """Number of training steps of the decoder; by default that of its plan."""
     motion: Path | None = None
-    """Weights whose generator to take, in place of training one."""
+    """Model file to take the generator from, in place of training one."""
     decoder: Path | None = None
-    """Weights whose decoder to take, in place of training one."""
+    """Model file to take the decoder from, in place of training one."""
     labels: Literal["all", "coma"] = "all"
-    """Of the generator: the dataset's 19, or neutral and the 12 of OT23."""
+    """Labels of the generator: the dataset's 19, or neutral and the 12 of OT23."""
     onsets_only: bool = False
-    """Train the generator on neutral -> peak alone."""
+    """Train the generator on neutral to peak alone."""
     release: bool = False
-    """Put the weights into the package."""
+    """Write the models into the package."""
     publish: bool = False
-    """Also write the record that the README quotes."""
+    """Also write the committed results in experiments/results."""
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Train, assemble, measure."""
+    """Train the networks, assemble the model file and measure its error."""
     data = makehuman4d.prepare(makehuman4d.Spec(config.level, config.subjects, config.meshes))
     shape = makehuman.template()
     hierarchy = mesh_hierarchy.build(shape.vertices, shape.faces, cache=cache.folder())
@@ -104,11 +108,11 @@ def run(config: Config) -> dict[str, Any]:
         decoder=decode,
         about={"made": made, "plans": {"motion": _motion_about(config), "decoder": _decoder_about(config)}},
     )
-    # Judged as the file holds them: rounded.
+    # Evaluated as saved: the file holds rounded weights.
     pipeline.save(config.out / bundle.RELEASED, models)
     models = pipeline.load(config.out / bundle.RELEASED)
     metrics = {
-        "error_mm": vertex_error.of_models(models, data, "test"),
+        "error_mm": vertex_error.model_errors(models, data, "test"),
         "seconds": {"motion": motion_seconds, "decoder": decoder_seconds},
     }
     models = models._replace(about=models.about | metrics)
@@ -139,7 +143,7 @@ def _motion_about(config: Config) -> dict[str, Any]:
 
 
 def _taken(path: Path, network: str) -> dict[str, Any]:
-    """How a network that comes from a file was made, as far as the file tells."""
+    """Return the provenance of a network as recorded in its model file."""
     about = pipeline.load(path).about
     known = {name: about[name] for name in ("made", "variant", "seed") if name in about}
     return about.get("plans", {}).get(network) or known
@@ -163,7 +167,7 @@ def _names(config: Config, data: dataset.Dataset) -> tuple[str, ...]:
 
 
 def _motion(config: Config, data: dataset.Dataset):
-    """The generator, the peaks that motions start from, and the seconds it took."""
+    """Return the generator with its start poses, and the seconds of training."""
     if config.motion is not None:
         found = pipeline.load(config.motion)
         return (found.motion, found.starts), 0.0
@@ -187,7 +191,7 @@ def _motion(config: Config, data: dataset.Dataset):
 
 
 def _decoder(config: Config, data: dataset.Dataset, hierarchy):
-    """The way from landmarks to meshes, and the seconds it took."""
+    """Return the decoder and the seconds of training."""
     if config.decoder is not None:
         return pipeline.load(config.decoder).decoder, 0.0
     folder, train = config.out / config.meshes_by, of_split(data, "train")
@@ -201,7 +205,7 @@ def _decoder(config: Config, data: dataset.Dataset, hierarchy):
 
 
 class _timed:
-    """Seconds spent in a folder's run, however often it was stopped."""
+    """Context manager that counts the seconds of a folder's run over all interruptions."""
 
     def __init__(self, folder: Path):
         self.path = folder / "seconds.json"
@@ -213,7 +217,7 @@ class _timed:
 
     def __exit__(self, *_: object) -> None:
         spent = time.perf_counter() - self.begun
-        # A finished run that is only read again has added nothing worth counting.
+        # Reading a finished run again takes seconds, which do not count as training.
         _run.write_text(
             self.path, json.dumps(round(self.before + (spent if spent > 30 or not self.before else 0.0), 1))
         )

@@ -1,15 +1,15 @@
-"""How natural are generated animations, and how faithful to their labels, in people's eyes? OT23, 4.4.
+"""Subjective evaluation of generated animations: naturalness, and faithfulness to the label (OT23, section 4.4).
 
-Makes one web page that needs no network: two examples of the scale's ends, then, in an order of each participant's
-own, animations that are scored from 0 to 10 for naturalness (NAT) and for faithfulness to the label (LAB). Neither the
-page nor a participant's file says how an animation was made; `items.json` does: keep it.
+Writes one web page that works offline: two examples of the ends of the scale, then the animations in an order drawn
+for each participant, to be scored from 0 to 10 for naturalness (NAT) and for faithfulness to the label (LAB). Neither
+the page nor a participant's file states how an animation was made; `items.json` does: keep it.
 
     python -m experiments.user_study --predecessor runs/predecessor/makehuman4d.safetensors
     python -m experiments.user_study --scores runs/user_study/scores
 
-The first makes `page.html` and `items.json`, about 3 minutes on 2 cores; the second makes the table of the files that
-participants handed in, in seconds. OT23 had 23 participants, NAT 7.22 and LAB 7.05; neutral → peak alone NAT 7.39,
-5.82 for the predecessor.
+The first command writes `page.html` and `items.json`, in about 3 minutes on 2 cores; the second, in seconds, writes
+the table of the participants' CSV files. No study has been run yet. OT23 had 23 participants: NAT 7.22 and LAB 7.05;
+neutral → peak alone NAT 7.39, and 5.82 for the predecessor.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from facejax.geometry import align
 from facejax.inference import pipeline
 from facejax.viz import eyes_teeth, render, video
 
-FACES, EXAMPLE_FACE = range(100, 119), 119  # test subjects of the dataset: no network has seen them
+FACES, EXAMPLE_FACE = range(100, 119), 119  # test subjects, which no network was trained on
 EXAMPLE = ("neutral", "high_smile", "neutral")
 TURN = 15  # degrees
-LEAD, REST = 8, 18  # frames of standing still before and after the motion, which repeats
-NOISE = 5.0  # mm, of the landmarks of the animation that has failed
+LEAD, REST = 8, 18  # still frames before and after the motion
+NOISE = 5.0  # mm, landmark noise of the failed example
 QUALITY = 88
 
 
@@ -47,29 +47,29 @@ class Config:
     out: Path = Path("runs/user_study")
     """Folder for the page, the list of its items, and the table."""
     seed: int = 0
-    """Of the labels, the faces and the generator's noise."""
+    """Seed of the labels, the faces and the generator's noise."""
     composed: int = 14
-    """Animations of three transitions each."""
+    """Number of animations of three transitions."""
     peaks: int = 14
-    """Neutral → peak animations of each generator."""
+    """Number of neutral → peak animations of each generator."""
     real: int = 4
-    """Real neutral → peak sequences of test subjects among the items, as a control."""
+    """Number of real neutral → peak sequences of test subjects, as a control."""
     model: Path | None = None
-    """Weights to judge in place of the released ones."""
+    """Model file to evaluate in place of the released models."""
     predecessor: Path | None = None
-    """Weights of a generator trained on neutral → peak alone; without them it has no items."""
+    """Model file of a generator trained on neutral → peak alone; without it the page has no items of it."""
     frames: int = 30
-    """Of one transition."""
+    """Number of frames of a transition."""
     width: int = 320
-    """Of the pictures, in pixels."""
+    """Width of the pictures in pixels."""
     scores: tuple[str, ...] | None = None
-    """Files of participants, or folders of them: make the table that they give, no page."""
+    """CSV files of participants, or folders of them: write the table of their scores instead of a page."""
     publish: bool = False
-    """Also write the figures that the README quotes."""
+    """Also write the committed results in experiments/results."""
 
 
 class Item(NamedTuple):
-    """What is shown; `number` names the generator's noise, so that both generators get the same."""
+    """An item of the study; `number` seeds the noise, the same for both generators."""
 
     kind: str
     labels: tuple[str, ...]
@@ -78,7 +78,7 @@ class Item(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """A moving face, and the first frame of each transition."""
+    """An animated face, and the first frame of each transition."""
 
     vertices: np.ndarray  # (T, N, 3)
     landmarks: np.ndarray  # (T, L, 3)
@@ -86,7 +86,7 @@ class Motion(NamedTuple):
 
 
 def run(config: Config) -> dict[str, Any]:
-    """Make the page, or the table of what came back from it."""
+    """Write the page, or with `--scores` the table of the participants' scores."""
     return _show(config) if config.scores is None else _judge(config)
 
 
@@ -105,7 +105,7 @@ def _show(config: Config) -> dict[str, Any]:
     _check(config)
     models = {"ours": pipeline.load(config.model)}
     if config.predecessor is None:
-        print("no --predecessor: the page goes without the neutral → peak animations of a second generator")
+        print("no --predecessor: the page has no neutral → peak animations of a second generator")
     else:
         models["predecessor"] = pipeline.load(config.predecessor)
     items = plan(config, models)
@@ -133,18 +133,21 @@ def _show(config: Config) -> dict[str, Any]:
 
 
 def _check(config: Config) -> None:
-    """Before any work: a page must be visible, and must not take the place of one that people have answered."""
+    """Raise `ValueError` for pictures that are too small, or where the folder holds answers to an earlier page."""
     if config.width < 16:
         raise ValueError(f"width: expected 16 pixels or more, got {config.width}")
     if any((config.out / "scores").glob("*.csv")):
-        raise ValueError(f"{config.out / 'scores'} has answers to the page that is there: name another --out")
+        raise ValueError(f"{config.out / 'scores'} holds answers to an earlier page: name another --out")
 
 
 def plan(config: Config, models: dict[str, pipeline.Models]) -> list[Item]:
-    """Which labels on which faces. Chains differ from one another, and so do peaks; every second chain ends at neutral.
+    """Choose the labels and faces of all items.
 
-    The predecessor's peaks and the real ones have the same labels and faces as ours. Raises `ValueError` where there
-    are fewer labels than wanted, or labels that somebody does not know.
+    Chains are distinct, and so are peaks; every second chain ends at neutral. The predecessor's and the real peaks have
+    the same labels and faces as ours.
+
+    Raises:
+        ValueError: for more items than there are labels, or labels unknown to the predecessor or the dataset.
     """
     neutral, *expressions = models["ours"].labels
     if not config.composed and not config.peaks:
@@ -169,7 +172,7 @@ def plan(config: Config, models: dict[str, pipeline.Models]) -> list[Item]:
 
 
 def _chains(rng: np.random.Generator, neutral: str, expressions: Sequence[str], count: int) -> list[tuple[str, ...]]:
-    """Half of them neutral → A → B → neutral, half neutral → A → B → C, in turn."""
+    """Draw chains, alternating neutral → A → B → C and neutral → A → B → neutral."""
     there, back = (list(itertools.permutations(expressions, length)) for length in (3, 2))
     if not 0 <= count <= 2 * len(back):
         raise ValueError(f"composed: expected 0 to {2 * len(back)} with {len(expressions)} expressions, got {count}")
@@ -183,7 +186,7 @@ def _moved(config: Config, models: dict[str, pipeline.Models], item: Item) -> Mo
         return _generated(config, models["predecessor" if item.kind == "predecessor" else "ours"], item)
     whole = _performed(item)
     take = performance.perform(item.labels[1], item.subject, seed=makehuman4d.SEED)
-    # Cut and drawn out like what the generator learns from: its tempo must not give it away.
+    # Cut and resampled like the generator's training motions, so that the tempo does not reveal it as real.
     rise = slice(take.onset, take.apex_start + 1)
     return Motion(*(np.asarray(align.resample(x[rise], frames=config.frames)) for x in whole[:2]), starts=(0,))
 
@@ -197,7 +200,7 @@ def _generated(config: Config, models: pipeline.Models, item: Item) -> Motion:
 
 
 def _performed(item: Item) -> Motion:
-    """The dataset's sequence of a label and a subject, whole: neutral → peak → neutral."""
+    """Return the dataset's whole sequence of a label and a subject: neutral → peak → neutral."""
     shape, person = makehuman.template(), makehuman.subject(item.subject)
     take = performance.perform(item.labels[1], item.subject, seed=makehuman4d.SEED)
     vertices = rig.pose(rig.build(person, level=makehuman4d.Spec().level), take.weights)[:, : len(shape.vertices)]
@@ -205,7 +208,7 @@ def _performed(item: Item) -> Motion:
 
 
 def _failed(config: Config, models: pipeline.Models, item: Item) -> Motion:
-    """A mesh still, but no face: frames in disorder, every landmark with another one's motion, and noise."""
+    """Return a failed animation, the example of score 0: shuffled frames, shuffled landmarks, and noise."""
     rng = np.random.default_rng([config.seed, item.number])
     sound, neutral = _generated(config, models, item), makehuman.subject(item.subject).vertices
     rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
@@ -215,7 +218,7 @@ def _failed(config: Config, models: pipeline.Models, item: Item) -> Motion:
 
 
 def _filmed(config: Config, models: pipeline.Models, item: Item, motion: Motion) -> _study.Film:
-    """A film, with the same eyes, teeth, light and point of view for all, and what is going on in words."""
+    """Render an animation with captions; eyes, teeth, light and camera are the same for all items."""
     rest = np.asarray(pipeline.neutral_landmarks(models, makehuman.subject(item.subject).vertices))
     size = (config.width, config.width * 5 // 4)
     pictures = render.frames(
@@ -229,7 +232,7 @@ def _filmed(config: Config, models: pipeline.Models, item: Item, motion: Motion)
         path = Path(folder) / "film.webp"
         video.write(path, pictures, fps=pipeline.RATE, quality=QUALITY)
         data = path.read_bytes()
-    # The kind belongs to the name: two generators might make the same picture.
+    # The hash includes the kind: two generators might produce the same pictures.
     name = hashlib.sha256(json.dumps(item).encode() + data).hexdigest()[:12]
     milliseconds = round(1000 * len(pictures) / pipeline.RATE)
     return _study.Film(name, item.labels, milliseconds, pictures.shape[2:0:-1], data)

@@ -32,7 +32,9 @@ def store_of_balls():
     for subject in range(len(splits)):
         stretch = np.eye(3) + 0.15 * rng.normal(size=(3, 3))
         neutral.append(vertices @ stretch.T + 3 * bump(int(rng.integers(162)), 30.0)[:, None] * rng.normal(size=3))
-        carrier = deformation_transfer.DeformationTransfer(vertices, neutral[-1], faces, np.full(len(vertices), 2.0))
+        carrier = deformation_transfer.DeformationTransfer(
+            vertices, neutral[-1], faces, deformation_transfer.anchor_weights(np.full(len(vertices), 2.0))
+        )
         for label, first, second in zip(labels, mixed, curved, strict=True):
             own = rng.uniform(0.5, 1.5) * strength
             moved.append(neutral[-1] + carrier(own * first + own**2 * second))

@@ -1,7 +1,6 @@
 """Benchmarks run on a tiny configuration, without their peers, and write what they promise."""
 
 import json
-import re
 import threading
 import time
 from pathlib import Path
@@ -35,6 +34,7 @@ from benchmarks import (
     srvf,
 )
 from facejax.data import transitions
+from facejax.evaluation import run_record
 from facejax.models.decoders import s2d_dec as s2d
 from facejax.models.motion import flow_matching
 from facejax.models.motion import motion3dgan as gan
@@ -150,7 +150,7 @@ def test_the_command_writes_rows_sizes_and_the_machine(tmp_path, monkeypatch, ca
     written = json.loads((tmp_path / "deep" / "work.json").read_text())
     assert written["rows"] == [row] and written["sizes"] == sizes and written["benchmark"] == "work"
     assert {"processor", "cores", "versions", "roofline", "peak_memory_mb", "commit"} <= set(written["machine"])
-    assert written["machine"]["cores"] == _machine.cores()
+    assert written["machine"]["cores"] == run_record.usable_cores()
     assert "batch^1.00" in capsys.readouterr().out
 
 
@@ -191,7 +191,7 @@ def test_a_baseline_tolerates_what_its_runs_differed_by():
         [ratio("steady", 4.0), ratio("noisy", 1.2)],
     ]
     found = _compare.baseline(runs)
-    assert found["steady"] == {"ratio": 4.0, "tolerance": _compare.LEAST, "runs": 2}
+    assert found["steady"] == {"ratio": 4.0, "tolerance": _compare.MIN_TOLERANCE, "runs": 2}
     assert found["noisy"]["tolerance"] == pytest.approx(1.5 * 0.2 / 1.1, abs=1e-3) and set(found) == {"steady", "noisy"}
     now = [ratio("steady", 3.3), ratio("noisy", 0.9), ratio("new", 2.0), ratio("alone", None)]
     assert _compare.slower(now, found) == ["steady"]
@@ -229,7 +229,7 @@ def test_all_benchmarks_run_in_processes_of_their_own(tmp_path, monkeypatch, cap
         return type("Done", (), {"returncode": 0})
 
     monkeypatch.setattr(__main__.subprocess, "run", start)
-    monkeypatch.setattr(_machine, "_commit", lambda: "abc")
+    monkeypatch.setattr(run_record, "commit", lambda folder: "abc")
     monkeypatch.setattr(__main__, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(_compare, "BASELINE", tmp_path / "baseline.json")
     assert __main__.main(["--out", str(tmp_path / "out"), "--publish", "--runs", "2"]) == 0
@@ -251,13 +251,11 @@ def test_the_committed_baseline_and_results_are_whole():
     assert _measure.table(rows) in (__main__.RESULTS / "cpu.md").read_text()
 
 
-def test_the_readme_quotes_the_figures_unchanged():
-    """A table between `<!-- benchmarks: NAME -->` and `<!-- end -->` is the one in benchmarks/results/NAME.md."""
-    readme = (__main__.ROOT / "README.md").read_text()
-    quoted = re.findall(r"<!-- benchmarks: (\w+) -->\n(.*?)\n<!-- end -->", readme, re.DOTALL)
-    assert {"cpu_headline", "h200_headline"} <= {name for name, _ in quoted}
-    for name, table in quoted:
-        assert table.strip() == (__main__.RESULTS / f"{name}.md").read_text().strip(), name
+def test_the_headline_is_that_of_the_record_and_shown_whole():
+    """docs/benchmarks.md includes the tables of benchmarks/results; the README quotes rows (`test_readme`)."""
+    page = (__main__.ROOT / "docs" / "benchmarks.md").read_text()
+    for name in ("cpu_headline", "cpu", "h200_headline", "h200"):
+        assert f'--8<-- "benchmarks/results/{name}.md"' in page
     parts = json.loads((__main__.RESULTS / "cpu.json").read_text())["benchmarks"]
     rows = [row for part in parts for row in part["rows"]]
     assert _headline.table(rows) == (__main__.RESULTS / "cpu_headline.md").read_text().strip()

@@ -38,7 +38,7 @@ def tiny(own_cache, monkeypatch):  # noqa: F811
     monkeypatch.setattr(fit_gpmm, "FOLDS", 2)
     monkeypatch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.0, 0.03))
     monkeypatch.setattr(fit_gpmm, "NOISE_GRID", (1e-4,))
-    monkeypatch.setattr(fit_gpmm, "JUDGED", 1)
+    monkeypatch.setattr(fit_gpmm, "EVALUATED_PEOPLE", 1)
 
 
 def test_table1_has_a_row_for_each_and_goes_on(tiny, tmp_path, monkeypatch):
@@ -77,12 +77,12 @@ def test_table1_on_a_store_of_ones_own(tiny, tiny_store, tmp_path):
 
 def test_a_result_is_made_anew_when_what_it_depends_on_changes(tiny, tiny_store, tmp_path, monkeypatch):
     case = _datasets.cases(tiny_store, ["identity"])[0]
-    regions, options = _datasets.regions_of(tiny_store), baselines.Options()
-    first = _mesh_eval.judge("still", case, tmp_path, options, regions)[0.0]
-    again = _mesh_eval.judge("still", case, tmp_path, options, regions)[0.0]
+    regions, options = _datasets.region_masks(tiny_store), baselines.Options()
+    first = _mesh_eval.evaluate("still", case, tmp_path, options, regions)[0.0]
+    again = _mesh_eval.evaluate("still", case, tmp_path, options, regions)[0.0]
     np.testing.assert_array_equal(first.distances.total, again.distances.total)
     fewer = case._replace(test=case.test.thin(2))
-    assert _mesh_eval.judge("still", fewer, tmp_path, options, regions)[0.0].distances.count < first.distances.count
+    assert _mesh_eval.evaluate("still", fewer, tmp_path, options, regions)[0.0].distances.count < first.distances.count
 
 
 def test_cases_share_nobody_or_no_expression(tiny_store):
@@ -252,13 +252,13 @@ def test_the_first_folds_alone(tiny_store, tmp_path):
 
 
 def test_two_datasets_in_other_topologies_are_told(tiny_store):
-    _datasets.check_alike(tiny_store, tiny_store)
+    _datasets.check_same_topology(tiny_store, tiny_store)
     with pytest.raises(ValueError, match="have other landmarks"):
-        _datasets.check_alike(
+        _datasets.check_same_topology(
             tiny_store, tiny_store._replace(landmark_index=np.asarray(tiny_store.landmark_index)[::-1])
         )
     with pytest.raises(ValueError, match="have other triangles"):
-        _datasets.check_alike(tiny_store, tiny_store._replace(faces=np.asarray(tiny_store.faces)[:-1]))
+        _datasets.check_same_topology(tiny_store, tiny_store._replace(faces=np.asarray(tiny_store.faces)[:-1]))
 
 
 def test_modes_exclude_each_other():

@@ -23,9 +23,8 @@ from experiments import (
 from facejax import augment
 from facejax.data import motions, transitions
 from facejax.data.synthetic import makehuman4d
-from facejax.evaluation import vertex_error
 from facejax.inference import expressions
-from facejax.training.recipes import fit_gpmm
+from facejax.training.recipes import fit_gpmm, fit_linear
 
 TINY = {"subjects": 6, "meshes": 260}
 
@@ -100,9 +99,9 @@ def test_the_choice_keeps_to_the_bounds_first():
         return {"anger": row | {"rest_network": rest, "whole_network": whole, "energy": energy}}
 
     table = {"truth": rows(0.5, 1.2), "ours": rows(0.7, 1.01), "coin": rows(0.6, 1.0, energy=0.7)}
-    assert expression_lstm.chosen(table) == "ours"
-    assert expression_lstm.chosen(table | {"ours, head kept": rows(0.1, 1.0)}) == "ours"
-    assert expression_lstm.chosen({"truth": rows(0.5, 1.2), "coin": rows(0.6, 1.1)}) == "truth"
+    assert expression_lstm.choose(table) == "ours"
+    assert expression_lstm.choose(table | {"ours, head kept": rows(0.1, 1.0)}) == "ours"
+    assert expression_lstm.choose({"truth": rows(0.5, 1.2), "coin": rows(0.6, 1.1)}) == "truth"
 
 
 def test_rbf_warp(own_cache, tmp_path):
@@ -139,10 +138,10 @@ def test_the_generator_is_chosen_within_the_bounds_of_real_people():
     row = {"accuracy": 0.98, "specificity_all_mm": 1.0, "real_all_mm": 1.0, "diversity_ratio": 1.0}
     row |= {"acceleration_ratio": 1.0, "energy": 0.2}
     table = {"flow": row, "gan": row | {"energy": 0.1, "diversity_ratio": 0.7}, "gaussian": row | {"energy": 0.3}}
-    assert generators.chosen(table, real) == "flow"
-    assert generators.chosen({"gan": table["gan"]}, real) == "gan"
+    assert generators.choose(table, real) == "flow"
+    assert generators.choose({"gan": table["gan"]}, real) == "gan"
     for broken in ({"accuracy": 0.95}, {"specificity_all_mm": 1.2}, {"acceleration_ratio": 1.4}):
-        assert not generators.meets(row | broken, real)
+        assert not generators.within_bounds(row | broken, real)
 
 
 def test_specificity(own_cache, tmp_path):
@@ -184,15 +183,19 @@ def test_interpolation(own_cache, tmp_path):
 
 def test_walks_are_those_of_the_library_and_takes_those_of_the_dataset(own_cache):
     data = makehuman4d.prepare(makehuman4d.Spec(0, **TINY))
-    halves = _interpolation_eval.joined(data, ("train",))
-    onsets = _interpolation_eval.onsets_of(halves)
+    halves = _interpolation_eval.read_splits(data, ("train",))
+    onsets = _interpolation_eval.onsets_only(halves)
     for pace in ("even", "performed"):
-        (theirs,) = motions.interpolated_transitions(onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace)
+        (theirs,) = motions.interpolated_transitions(
+            onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace
+        )
         pairs = augment.spread(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
-        mine = _interpolation_eval.walk(*(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace)
+        mine = _interpolation_eval.peak_transitions(
+            *(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace
+        )
         np.testing.assert_allclose(mine.curves, theirs.curves, atol=1e-6)
     direct = motions.direct_transitions(data, "test").take(np.arange(3))
-    np.testing.assert_allclose(_interpolation_eval.again(data, direct, take=0).curves, direct.curves, atol=1e-6)
+    np.testing.assert_allclose(_interpolation_eval.perform_again(data, direct, take=0).curves, direct.curves, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -104,7 +104,7 @@ def test_generators_are_chosen(own_cache, own, model, tmp_path, monkeypatch):  #
 
 
 def test_too_few_people_are_told(own_cache, own, model, monkeypatch):  # noqa: F811
-    monkeypatch.setattr("experiments._judged.FEWEST", 6)
+    monkeypatch.setattr("experiments._motion_eval.MIN_COUNT", 6)
     with pytest.raises(ValueError, match="expected 6 or more people in the test split, got 5"):
         specificity.run(specificity.Config(data=own, models=(model,)))
 
@@ -172,29 +172,17 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
 
 def test_a_take_is_carried_onto_itself_and_stretched(own):
     data = dataset.open_dataset(own)
-    take = _motion_transfer.stored(data, 14, "gape")
-    np.testing.assert_allclose(_motion_transfer.onto(take, take, data.landmark_index), take.landmarks, atol=2e-3)
+    take = _motion_transfer.find_recording(data, 14, "gape")
+    np.testing.assert_allclose(_motion_transfer.transfer(take, take, data.landmark_index), take.landmarks, atol=2e-3)
     np.testing.assert_array_equal(
         take.vertices[:, data.landmark_index], (take.rest[data.landmark_index] + take.landmarks)[take.at]
     )
     longer = take._replace(landmarks=np.repeat(take.landmarks, 2, axis=0))
-    carried = _motion_transfer.onto(take, longer, data.landmark_index)
+    carried = _motion_transfer.transfer(take, longer, data.landmark_index)
     np.testing.assert_allclose(carried[[0, -1]], take.landmarks[[0, -1]], atol=2e-3)
     energy = [np.linalg.norm(curve, axis=-1).mean(axis=-1) for curve in (carried, take.landmarks)]
     assert energy[0].argmax() // 2 == pytest.approx(energy[1].argmax(), abs=1)
-    assert _motion_transfer.stored(data, 14, "sneer") is None
-
-
-def test_errors_look_about_in_a_window():
-    rest = np.zeros((2, 3))
-    true = np.arange(8.0)[:, None, None] + np.zeros((8, 2, 3))
-    take = _motion_transfer.Take("p", rest, true, np.array([0, 5, 7]), true[[0, 5, 7]])
-    late = true - 2  # two frames behind
-    aligned, best = _motion_transfer.errors(late, take, np.ones(2, bool), 4)
-    np.testing.assert_allclose(aligned, 2 * np.sqrt(3))
-    # The last frame has nothing after it to look at.
-    np.testing.assert_allclose(best, [0, 0, 2 * np.sqrt(3)], atol=1e-9)
-    np.testing.assert_array_equal(_motion_transfer.errors(late, take, np.ones(2, bool), 0)[1], aligned)
+    assert _motion_transfer.find_recording(data, 14, "sneer") is None
 
 
 def test_what_only_makehuman4d_has(own_cache, own, tmp_path):  # noqa: F811

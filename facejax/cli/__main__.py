@@ -1,4 +1,4 @@
-"""`python -m facejax.cli`: the `facejax` command."""
+"""Run the `facejax` command as `python -m facejax.cli`."""
 
 from facejax.cli.main import main
 

@@ -1,4 +1,4 @@
-"""What the command line takes: one record per command, its fields the flags and their help."""
+"""Arguments of the command line: one record per command; its fields are the flags, their docstrings the help."""
 
 from __future__ import annotations
 
@@ -16,110 +16,114 @@ class Generate:
     """Animate a neutral face through two or more expressions; with --count write a corpus of many motions."""
 
     out: Path
-    """Folder for the results; made if it is missing."""
+    """Output folder; created if it is missing."""
     end: str | None = None
-    """Expression to arrive at; `facejax labels` lists them. A corpus may go without: each motion then has its own."""
+    """Final expression; `facejax labels` lists them. With --count it may be left out: each motion then has random
+    labels."""
     start: str = "neutral"
-    """Expression to start from."""
+    """Initial expression."""
     then: UseAppendAction[tuple[str, ...]] = ()
     """A further expression; repeat the flag: `--then A --then B`."""
     face: Path | None = None
-    """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average. With
-    --landmarks any scan of a head."""
+    """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average face.
+    With --landmarks: a scan of a head in any topology."""
     landmarks: Path | None = None
-    """Of a scan in any topology, whose own vertices are animated; see `facejax register`."""
+    """Landmarks of a scan given by --face, whose own vertices are animated; see `facejax register`."""
     model: Path | None = None
-    """Weights to use in place of the released ones."""
+    """Model file; default: the released models."""
     seed: int = 7
-    """Another seed, another motion."""
+    """Random seed of the motion."""
     samples: int = 1
-    """How many motions to draw."""
+    """Number of motions."""
     frames: int | Literal["natural"] = 30
-    """Frames of each transition; "natural": as long as people take, generated with the motion."""
+    """Frames of each transition; "natural": durations generated with the motion, as people perform it."""
     fps: float = 30.0
-    """Frames per second of the results."""
+    """Frames per second of the output."""
     intensity: float = 1.0
-    """Scale of the motion, 0 to 2."""
+    """Scale of the displacements, 0 to 2."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
-    """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
+    """Output formats; landmarks are always written as NPZ. "ply" and "obj" write a folder of frames."""
     count: int | None = None
-    """Write a corpus instead: so many motions, as NPZ files with an index. Stopped, it goes on when called again."""
+    """Write a corpus of so many motions instead, as NPZ files with an index. Run again to resume an interrupted one."""
     people: int = 0
-    """With --count: draw each motion's face from so many MakeHuman people. Default: the one face."""
+    """With --count: draw each motion's face from so many MakeHuman people. Default: one face for all motions."""
     meshes: bool = False
-    """With --count: vertices as well as landmarks."""
+    """With --count: write vertices as well as landmarks."""
     shard: int | None = None
-    """With --count: motions in a file, by default as many as make 64 MB."""
+    """With --count: motions per file; default: as many as fit in 64 MB."""
     distributed: bool = False
-    """With --count: share the work with the other processes of a job, see `facejax.runtime.join_distributed`."""
+    """With --count: share the work with the other processes of a job, see `facejax.cli.runtime.join_distributed`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Animate:
-    """Animate any mesh through its landmarks: by an expression network, by transitions, or by a recording."""
+    """Animate any mesh through its landmarks: by an expression network, by generated transitions, or by a recording."""
 
     out: Path
-    """Folder for the results; made if it is missing."""
+    """Output folder; created if it is missing."""
     mesh: Path | None = None
-    """Any face or head (PLY, OBJ, GLB, NPZ), in any topology, unit and pose. Default: a MakeHuman face."""
+    """Face or head (PLY, OBJ, GLB, NPZ) in any topology, unit and pose. Default: a MakeHuman face."""
     landmarks: Path | None = None
-    """Its 68, 66, 51 or 83 landmarks: JSON of vertices, positions or triangles, MeshLab .pp, plain text, or the
-    embedding of FLAME. MakeHuman's head, 3,260 vertices, goes without."""
+    """Its 68, 66, 51 or 83 landmarks: JSON of vertices, positions or triangles, MeshLab .pp, plain text, or a landmark
+    embedding of FLAME. MakeHuman's head of 3,260 vertices does not need them."""
     expression: str | None = None
-    """Driven by an expression network: anger, disgust, fear, happiness, sadness or surprise."""
+    """Motion of an expression network: anger, disgust, fear, happiness, sadness or surprise."""
     end: str | None = None
-    """Driven by generated transitions: the expression to arrive at; `facejax labels` lists them."""
+    """Motion of generated transitions: the final expression; `facejax labels` lists them."""
     start: str = "neutral"
-    """With --end: the expression to start from."""
+    """With --end: the initial expression."""
     then: UseAppendAction[tuple[str, ...]] = ()
     """With --end: a further expression; repeat the flag."""
     livelink: Path | None = None
-    """Driven by a recording of Live Link Face (CSV)."""
+    """Motion of a Live Link Face recording (CSV)."""
     begin: float = 0.0
-    """With --livelink: seconds into the recording."""
+    """With --livelink: start time in the recording, in seconds."""
     seconds: float = 10.0
-    """With --livelink: how much of it."""
+    """With --livelink: duration in seconds."""
     keep_rest: bool = False
-    """With --livelink: take the weights as they are, not relative to the person's resting face."""
+    """With --livelink: use the recorded weights, not their differences from the person's resting face."""
     person: int | None = None
-    """Without --mesh: which MakeHuman person (100 to 119 are test subjects). Default: the average face."""
+    """Without --mesh: index of a MakeHuman person (100 to 119 are test subjects). Default: the average face."""
     frames: int | Literal["natural"] | None = None
-    """Frames of each transition (30; "natural": as long as people take), or at most of an expression."""
+    """Frames of each transition (default 30; "natural": durations generated with the motion), or the maximal length of
+    an expression."""
     whole: bool = False
-    """With --expression: go on to the last frame, though the expression is over."""
+    """With --expression: play all frames, also those after the expression has ended."""
     seed: int = 7
-    """With --end: another seed, another motion."""
+    """With --end: random seed of the motion."""
     model: Path | None = None
-    """Weights to use in place of the released ones."""
+    """Model file, or file of expression networks; default: the released one."""
     kernel: str | None = None
     """Radial basis function: gaussian, multiquadric, thin_plate, triharmonic or wendland_c2."""
     sigma: float | None = None
-    """Width of the kernel, in spacings of the landmarks."""
+    """Width of the kernel, in units of the landmarks' spacing."""
     smoothing: float = 0.0
-    """Above 0, noisy landmarks need not be met exactly."""
+    """Smoothing of noisy landmarks; 0 interpolates them exactly."""
     pin: bool = True
-    """Hold rims still that are far from every landmark, such as the neck's."""
+    """Keep rims fixed that are far from every landmark, such as the neck's."""
     head: bool = False
-    """The motion turns the head, too (networks trained on heads that move): let all of the mesh go with it."""
+    """Apply the motion's rigid head rotation to the whole mesh (for networks trained on heads that move)."""
     intensity: float = 1.0
-    """Scale of the motion, 0 to 2."""
+    """Scale of the displacements, 0 to 2."""
     fps: float | None = None
-    """Frames per second of the results; as the motion was made by default."""
+    """Frames per second of the output; default: those of the motion."""
     formats: tuple[Format, ...] = ("glb", "html", "webp")
-    """What to write; the landmarks come as NPZ in any case. "ply" and "obj" write a folder of frames."""
+    """Output formats; landmarks are always written as NPZ. "ply" and "obj" write a folder of frames."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Register:
-    """Bring the template onto a scan of a head: any vertices, holes, noise, unit and pose."""
+    """Register the template to a scan of a head in any topology, unit and pose, with holes and noise."""
 
     scan: Positional[Path]
     """The scan: PLY, OBJ, GLB or NPZ."""
     landmarks: Path
-    """On it: 68, 66, 51 or 83, or seven (outer and inner corner of the right eye, inner and outer of the left, tip of
-    the nose, right and left corner of the mouth), or any with names of the 68; formats as of `facejax animate`."""
+    """Landmarks of the scan: 68, 66, 51 or 83, or seven (outer and inner corner of the right eye, inner and outer of
+    the left, nose tip, right and left corner of the mouth), or any with names of the 68; formats as of
+    `facejax animate`."""
     out: Path
-    """Folder for the template on the scan, its 68 landmarks, a picture and the distances; made if it is missing."""
+    """Output folder for the registered template, its 68 landmarks, a picture and the distances; created if it is
+    missing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,35 +131,35 @@ class Demo:
     """Animate three unseen faces: neutral, high_smile, mouth_open, neutral."""
 
     out: Path = Path("runs/demo")
-    """Folder for the results."""
+    """Output folder."""
     seed: int = 7
-    """Another seed, other motions."""
+    """Random seed of the motions."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Labels:
-    """List the expressions that the model knows."""
+    """List the expressions of a model."""
 
     model: Path | None = None
-    """Weights to ask in place of the released ones."""
+    """Model file; default: the released models."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MakeHuman:
-    """Prepare the free 4D dataset, or write neutral faces to try (`--sample`)."""
+    """Generate the free synthetic 4D dataset, or write neutral sample faces (`--sample`)."""
 
     sample: Path | None = None
-    """Write neutral faces into this folder, and prepare nothing."""
+    """Write neutral faces to this folder instead of a dataset."""
     count: int = 5
-    """How many faces to write."""
+    """With --sample: number of faces."""
     level: Literal[0, 1, 2, 3] = 3
     """Realism of the dataset."""
     head_motion: bool = False
-    """Let heads turn and lean."""
+    """Add rigid head motion."""
     noise: float = 0.0
-    """Registration noise in mm, smooth over the surface; 0.1 to 0.5 is what scans have."""
+    """Registration noise in mm, smooth over the surface; real scans have 0.1 to 0.5."""
     out: Path | None = None
-    """Where the dataset goes; the user's cache by default."""
+    """Folder of the dataset; default: the user's cache."""
 
 
 Layout = Literal["folder", "coma", "d3dfacs", "florence4d", "vocaset", "bu3dfe", "bu4dfe", "livelink"]
@@ -163,47 +167,47 @@ Layout = Literal["folder", "coma", "d3dfacs", "florence4d", "vocaset", "bu3dfe",
 
 @dataclasses.dataclass(frozen=True)
 class Prepare:
-    """Read recordings into a dataset: your own, or a dataset that you have. Stopped, it goes on when called again."""
+    """Convert recordings into a dataset: your own, or a public dataset. Run again to resume an interrupted one."""
 
     source: Positional[Layout]
-    """How they lie. folder: ROOT/SUBJECT/RECORDING/*.ply (.obj, .npy, .npz), or ROOT/SUBJECT/RECORDING.npz."""
+    """Layout of the files. folder: ROOT/SUBJECT/RECORDING/*.ply (.obj, .npy, .npz), or ROOT/SUBJECT/RECORDING.npz."""
     root: Path
-    """The dataset's folder."""
+    """Folder of the recordings."""
     out: Path
-    """Where the prepared dataset goes: a folder that is not there yet."""
+    """Output folder of the dataset; it must not exist."""
     landmarks: Path | None = None
-    """Of the first subject's neutral mesh: JSON of vertices, positions or triangles, MeshLab .pp, plain text, or the
-    embedding of FLAME. bu4dfe and livelink go without."""
+    """Landmarks of the first subject's neutral mesh: JSON of vertices, positions or triangles, MeshLab .pp, plain text,
+    or a landmark embedding of FLAME. Not needed by bu4dfe and livelink."""
     unit: Literal["mm", "cm", "m"] | None = None
-    """Of the meshes; recognised by the size of the face by default."""
+    """Unit of the meshes; default: inferred from the size of the face."""
     fps: float | None = None
-    """Frames per second of the recordings; the dataset's own by default, of folders 30."""
+    """Frames per second of the recordings; default: those of the dataset, 30 for folders."""
     rest: Literal["first", "mean"] | None = None
-    """Who has no neutral mesh is at rest in the first frame of the first recording (default), or in the mean of the
+    """Neutral mesh of subjects without one: the first frame of their first recording (default), or the mean of the
     first frames of all."""
     gaps: bool = False
-    """Take recordings that lack frames as they are, and say so."""
+    """Accept recordings with missing frames, and report them."""
     hold: bool = False
-    """Take the rigid motion of the head out."""
+    """Remove the rigid motion of the head."""
     labels: Path | None = None
-    """CSV of subject, recording, label; by default a label is the recording's name without a number at the end."""
+    """CSV of subject, recording, label; default: the recording's name without a final number."""
     people: Path | None = None
-    """CSV of subject and what is known: split (train, validation, test), sex."""
+    """CSV of subject and attributes: split (train, validation, test), sex."""
     cuts: Path | None = None
-    """CSV of subject, recording, onset, apex_start, apex_end, offset, as frames from 0 on; found by default."""
+    """CSV of subject, recording, onset, apex_start, apex_end, offset, as frame numbers from 0; default: detected."""
     template: Path | None = None
     """vocaset: a mesh with FLAME's triangles."""
     actors: int | None = None
-    """livelink: on how many MakeHuman people the recordings are played (12)."""
+    """livelink: number of MakeHuman people that perform the recordings (12)."""
     meshes: int = 20_000
-    """How many meshes are stored, drawn by a fixed seed; landmarks are stored of all frames."""
+    """Number of meshes to store, drawn with a fixed seed; landmarks of all frames are stored."""
     workers: int | None = None
-    """Processes; by default one for each processor where there is much to read."""
+    """Number of processes; default: one for each processor where there is much to read."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Data:
-    """Prepare a dataset: the free one, or your own meshes."""
+    """Prepare a dataset: the free synthetic one, or your own meshes."""
 
     what: OmitArgPrefixes[
         Annotated[MakeHuman, subcommand("makehuman", prefix_name=False)]
@@ -213,30 +217,30 @@ class Data:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Train models on a prepared dataset, for `facejax generate --model`. Stopped, it goes on when called again."""
+    """Train models on a dataset, for `facejax generate --model`. Run again to resume an interrupted training."""
 
     data: Path
-    """A prepared dataset, your own (`facejax data prepare folder`) or makehuman4d's folder."""
+    """Folder of a prepared dataset: your own (`facejax data prepare folder`) or makehuman4d."""
     out: Path
-    """The models: a file that ends in .safetensors. Checkpoints lie in a folder beside it."""
+    """Output model file; it must end in .safetensors. Checkpoints are kept in a folder beside it."""
     seed: int = 0
-    """Of the initial weights and the order of the data."""
+    """Random seed of the initial weights and the order of the data."""
     quick: bool = False
-    """A few steps only, to see that everything is in order."""
+    """Train a few steps only, as a test of the set-up."""
     distributed: bool = False
-    """Share each batch with the other processes of a job, see `facejax.runtime.join_distributed`."""
+    """Share each batch with the other processes of a job, see `facejax.cli.runtime.join_distributed`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Show an animation or a mesh: writes one HTML page and opens it."""
+    """Show an animation or a mesh in a browser: write one HTML page and open it."""
 
     file: Positional[Path]
-    """NPZ with `vertices` and `faces`, PLY, OBJ, GLB, or an HTML page made before."""
+    """NPZ with `vertices` and `faces`, PLY, OBJ, GLB, or an HTML page written before."""
     out: Path | None = None
-    """Where the page goes; beside the file by default."""
+    """The page, or a folder for it; default: beside the file."""
     fps: float | None = None
-    """Frames per second; the file's own, or 30."""
+    """Frames per second; default: those of the file, or 30."""
     open: bool = True
     """Open the page in a browser."""
 

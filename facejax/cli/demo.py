@@ -1,4 +1,4 @@
-"""The main job on three unseen faces, as `make demo` runs it."""
+"""`facejax demo`: labels to meshes on three unseen faces, with timings; `make demo` runs it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from facejax.cli import outputs, runtime
+from facejax.cli.arguments import Demo
 from facejax.data.synthetic import makehuman
 from facejax.inference import pipeline
 from facejax.io import atomic
@@ -19,13 +20,18 @@ from facejax.viz import render
 from facejax.viz.scene import Scene
 
 LABELS = ("neutral", "high_smile", "mouth_open", "neutral")
-SUBJECTS = (100, 107, 115)  # of the test split: no network has seen them
+SUBJECTS = (100, 107, 115)  # test subjects: not in the training data of any network
 SHEET_FRAMES = 8
-PICTURE = (200, 250)
+PICTURE_SIZE = (200, 250)
 
 
-def run(out: Path, *, seed: int = 7) -> Path:
-    """Three unseen faces through `LABELS`; returns the summary's path."""
+def run(command: Demo) -> None:
+    """Write the animations, and print the summary."""
+    print(animate_subjects(command.out, seed=command.seed).read_text())
+
+
+def animate_subjects(out: Path, *, seed: int = 7) -> Path:
+    """Animate `SUBJECTS` through `LABELS`; return the path of the summary."""
     clock = _Clock()
     runtime.configure()
     outputs.make_output_folder(out)
@@ -34,37 +40,37 @@ def run(out: Path, *, seed: int = 7) -> Path:
     models = pipeline.load()
     clock.lap("weights")
     keys = jax.random.split(jax.random.key(seed), len(people))
-    rows, marks, names = [], [], [person.name for person in people]
+    rows, marks, names, shown = [], [], [person.name for person in people], np.zeros(0, int)
     with outputs.progress("demo", 3 * len(people) + 2) as advance:
         for person, key in zip(people, keys, strict=True):
             moved = pipeline.landmarks(models, key, LABELS, person.vertices)
             vertices = np.asarray(jax.block_until_ready(pipeline.meshes(models, moved, person.vertices)))
             clock.lap("labels to meshes" if marks else "labels to meshes, first (compiles, or reads the cache)")
             marks.append(np.asarray(moved))
-            scene = outputs.scene_of(models, person.vertices, vertices, marks[-1], LABELS, 30)
+            scene = outputs.scene_of(models, person.vertices, vertices, marks[-1], LABELS, pipeline.FRAMES)
             for suffix in ("glb", "html", "webp"):
                 outputs.save(out, person.name, suffix, scene, pipeline.RATE)
                 clock.lap(f"{suffix} files")
                 advance()
-            chosen = np.linspace(0, len(vertices) - 1, SHEET_FRAMES).round().astype(int)
-            rows.append(_pictures(scene, chosen))
+            shown = np.linspace(0, len(vertices) - 1, SHEET_FRAMES).round().astype(int)
+            rows.append(_pictures(scene, shown))
             clock.lap("contact sheet")
-        labels = [f"frame {t + 1}" for t in chosen]
+        labels = [f"frame {t + 1}" for t in shown]
         render.save(out / "contact_sheet.png", render.contact_sheet(rows, row_labels=names, column_labels=labels))
         advance()
-        outputs.save_landmarks(out / "landmarks.npz", np.stack(marks), LABELS, 30, pipeline.RATE)
+        outputs.save_landmarks(out / "landmarks.npz", np.stack(marks), LABELS, pipeline.FRAMES, pipeline.RATE)
         advance()
     return _summary(out, names, clock)
 
 
 def _pictures(scene: Scene, chosen: np.ndarray) -> np.ndarray:
     parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
-    camera = render.fit_camera(scene.vertices, size=PICTURE, turn=15)
-    return render.frames(scene.vertices[chosen], scene.faces, size=PICTURE, camera=camera, extras=parts)
+    camera = render.fit_camera(scene.vertices, size=PICTURE_SIZE, turn=15)
+    return render.frames(scene.vertices[chosen], scene.faces, size=PICTURE_SIZE, camera=camera, extras=parts)
 
 
 class _Clock:
-    """Seconds by name, added up."""
+    """Seconds spent on each named step, summed."""
 
     def __init__(self) -> None:
         self.begun = self.last = time.perf_counter()
@@ -83,7 +89,7 @@ def _summary(out: Path, names: Sequence[str], clock: _Clock) -> Path:
         "",
         f"{' → '.join(LABELS)} on {len(names)} unseen faces ({', '.join(names)}), 88 frames each.",
         "",
-        "* `NAME.glb` animated glTF, `NAME.html` viewer in one page, `NAME.webp` film",
+        "* `NAME.glb` animated glTF, `NAME.html` viewer in one page, `NAME.webp` video",
         "* `contact_sheet.png` three faces by eight frames, `landmarks.npz` the generated landmarks",
         "",
         "| step | seconds |",

@@ -1,11 +1,12 @@
-"""Animations made into files: which formats, where, and how the work shows itself.
+"""Write animations in the requested formats; show progress on standard error; report files on standard output.
 
-Everything that can be wrong with a request is checked before the first file is written; every file appears whole.
+Every file is written whole or not at all.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,35 +22,17 @@ from facejax.viz import eyes_teeth, video
 from facejax.viz import scene as viz_scene
 from facejax.viz.scene import Scene
 
-FILM_RATE = 15.0  # frames per second of films: half the motion's, since drawing dominates the time
-
-
-def check_formats(formats: Sequence[str]) -> None:
-    """Raise, before any work is done, where a format cannot be written on this machine."""
-    if not formats:
-        raise ValueError("--formats: expected at least one")
-    for suffix in formats:
-        if f".{suffix}" in video.FORMATS:
-            try:
-                video.check(Path(f"film.{suffix}"))
-            except ImportError as error:
-                raise ValueError(f"--formats {suffix}: {error}") from error
-
-
-def check_rate(fps: float) -> None:
-    """Raise for frames per second that no player shows."""
-    if not 0 < fps <= 1000:
-        raise ValueError(f"--fps must lie above 0, up to 1000, got {fps}")
+VIDEO_FPS = 15.0  # frames per second of videos: half of the motion's, since rendering takes most of the time
 
 
 def file_stem(labels: Sequence[str]) -> str:
-    """A file name for a motion through labels; a long chain is named by its ends."""
+    """Return the file name of a motion through labels; a long sequence is named by its first and last label."""
     whole = "_".join(labels)
     return whole if len(whole) <= 80 else f"{labels[0]}_{labels[-1]}_{len(labels) - 1}_transitions"
 
 
 def make_output_folder(folder: Path) -> None:
-    """Make a folder, or say in one line why files cannot be put there."""
+    """Make a folder. Raises `ValueError` where it cannot be made or written to."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -58,26 +41,45 @@ def make_output_folder(folder: Path) -> None:
         raise ValueError(f"{folder}: not writable; name another folder with --out")
 
 
+def report(files: Sequence[Path], notes: Sequence[str] = ()) -> None:
+    """Print notes on what was assumed to standard error, and the paths of files to standard output."""
+    for note in notes:
+        print(atomic.one_line(note), file=sys.stderr)
+    print("\n".join(str(path) for path in files))
+
+
 def scene_of(
-    models: pipeline.Models, neutral: np.ndarray, vertices: np.ndarray, marks: np.ndarray, labels, frames
+    models: pipeline.Models,
+    neutral: np.ndarray,
+    vertices: np.ndarray,
+    landmarks: np.ndarray,
+    labels: Sequence[str],
+    frames: int | Sequence[int],
 ) -> Scene:
-    """A generated animation with eyes, teeth and captions: neutral (N, 3), vertices (T, N, 3), marks (T, L, 3)."""
+    """Return a generated animation with eyes, teeth and captions.
+
+    Args:
+      neutral: (N, 3) vertices at rest; mm.
+      vertices: (T, N, 3).
+      landmarks: (T, L, 3).
+      labels, frames: as of `pipeline.landmarks`.
+    """
     rest = np.asarray(pipeline.neutral_landmarks(models, neutral))
-    parts = eyes_teeth.parts(eyes_teeth.template(), rest, marks)
+    parts = eyes_teeth.parts(eyes_teeth.template(), rest, landmarks)
     captions = pipeline.captions(labels, frames=frames)
-    return viz_scene.make(vertices, np.asarray(models.face.faces), captions=captions, landmarks=marks, extras=parts)
+    return viz_scene.make(vertices, np.asarray(models.face.faces), captions=captions, landmarks=landmarks, extras=parts)
 
 
 def save(out: Path, stem: str, suffix: str, scene: Scene, fps: float) -> Path:
-    """Write a scene as `out/stem.suffix` ("ply" and "obj": a folder of frames); returns the path."""
+    """Write a scene as `out/stem.suffix` ("ply" and "obj": a folder of frames); return the path."""
     path, options = out / f"{stem}.{suffix}", {"captions": scene.captions, "extras": scene.extras}
     if suffix in ("ply", "obj"):
         path = out / f"{stem}-{suffix}"
         io.meshes.write_sequence(path, scene.vertices, scene.faces, format=suffix)
         return path
     if f".{suffix}" in video.FORMATS:
-        every = max(1, round(fps / FILM_RATE))
-        scene, fps = _thinned(scene, every), fps / every
+        every = max(1, round(fps / VIDEO_FPS))
+        scene, fps = _subsample(scene, every), fps / every
         options = {"captions": scene.captions, "extras": scene.extras, "size": (256, 320)}
     elif suffix == "html":
         options["landmarks"] = scene.landmarks
@@ -87,8 +89,26 @@ def save(out: Path, stem: str, suffix: str, scene: Scene, fps: float) -> Path:
     return path
 
 
-def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], frames, fps: float) -> Path:
-    """An NPZ of the landmarks (S, T, L, 3), the labels, and the first frame of each transition."""
+def save_all(out: Path, stem: str, formats: Sequence[str], scene: Scene, fps: float) -> list[Path]:
+    """Write a scene in every format, and its landmarks (T, L, 3) as NPZ; return the paths."""
+    make_output_folder(out)
+    written = []
+    with progress("writing", len(formats) + 1) as advance:
+        for suffix in formats:
+            written.append(save(out, stem, suffix, scene, fps))
+            advance()
+        path = out / f"{stem}-landmarks.npz"
+        with atomic.replace_file(path) as temporary:
+            np.savez(temporary, landmarks=np.asarray(scene.landmarks), fps=np.float64(fps))
+        written.append(path)
+        advance()
+    return written
+
+
+def save_landmarks(
+    path: Path, landmarks: np.ndarray, labels: Sequence[str], frames: int | Sequence[int], fps: float
+) -> Path:
+    """Write an NPZ of landmarks (S, T, L, 3), labels, and the first frame of each transition; return the path."""
     starts = np.array([start for start, _ in pipeline.captions(labels, frames=frames)])
     with atomic.replace_file(path) as temporary:
         np.savez(
@@ -98,8 +118,8 @@ def save_landmarks(path: Path, landmarks: np.ndarray, labels: Sequence[str], fra
     return path
 
 
-def _thinned(scene: Scene, every: int) -> Scene:
-    # The last frame is where the motion was going: it stays.
+def _subsample(scene: Scene, every: int) -> Scene:
+    """Keep each `every`-th frame, and the last one: it is where the motion ends."""
     chosen = np.append(np.arange(0, len(scene.vertices) - 1, every), len(scene.vertices) - 1)
     parts = [p._replace(vertices=p.vertices[chosen]) if p.vertices.ndim == 3 else p for p in scene.extras]
     captions = tuple((-(-start // every), text) for start, text in scene.captions)
@@ -108,7 +128,10 @@ def _thinned(scene: Scene, every: int) -> Scene:
 
 @contextmanager
 def progress(name: str, total: int | None) -> Iterator:
-    """A bar on a terminal; silent elsewhere. Called with nothing: one step more; else what is done, and of how much."""
+    """Show a progress bar where standard error is a terminal.
+
+    Yields a function: without arguments it adds one step; `advance(done, total)` sets both numbers.
+    """
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

@@ -1,7 +1,7 @@
 """Corpora of generated motions on disk, as written by `facejax.inference.corpus`: shards and an index.
 
-    FOLDER/index.json            schema, request and, for each shard, first sequence, count, bytes, SHA-256; written last
-    FOLDER/shards/000000.npz     landmarks (n, T, L, 3) mm, labels (n, P + 1), person (n,), optional vertices (n, T, N, 3)
+    FOLDER/index.json          schema, request, and each shard's first sequence, count, bytes and SHA-256; written last
+    FOLDER/shards/000000.npz   landmarks (n, T, L, 3) mm, labels (n, P + 1), person (n,), optional vertices (n, T, N, 3)
 
 Files may be untrusted: shard names cannot leave the folder, sizes are bounded, nothing is unpickled.
 """

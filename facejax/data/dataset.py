@@ -164,7 +164,11 @@ def _find_inconsistency(
         )
     drawn, landmark_index, faces = arrays["drawn"], arrays["landmark_index"], arrays["faces"]
     count = arrays["neutral"].shape[1]
-    for name, array, end in (("drawn", drawn, rows), ("landmark_index", landmark_index, count), ("faces", faces, count)):
+    for name, array, end in (
+        ("drawn", drawn, rows),
+        ("landmark_index", landmark_index, count),
+        ("faces", faces, count),
+    ):
         if array.dtype.kind not in "iu" or (array.size and not 0 <= array.min() <= array.max() < end):
             return f"{name}.npy must contain integers from 0 to {end - 1}"
     if len(drawn) != len(arrays["vertices"]):

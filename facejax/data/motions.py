@@ -1,8 +1,11 @@
-"""Motions for Motion3DGAN, cut from a 4D dataset: displacements from neutral, unitless, 30 frames each.
+"""Motions for Motion3DGAN, cut from a 4D dataset: unitless displacements from neutral of 30 frames each.
 
-Unitless: divided by the centred Frobenius norm of the subject's neutral landmarks, which is returned so that
-figures can be given in millimetres. Halves are neutral -> peak (onset to the start of the apex) and peak -> neutral
-(end of the apex to offset), resampled uniformly in time; OT23, 4.1."""
+Unitless means divided by the centred Frobenius norm of the subject's neutral landmarks, which is returned as `scale`
+so that results can be given in millimetres. Halves are neutral -> peak (onset to the start of the apex) and
+peak -> neutral (end of the apex to offset), resampled uniformly in time (OT23, 4.1).
+
+K motions, T frames, L landmarks.
+"""
 
 from __future__ import annotations
 
@@ -25,26 +28,38 @@ class Motions(NamedTuple):
     curves: np.ndarray  # (K, T, L, 3) displacements from neutral, unitless
     start: np.ndarray  # (K,) int32
     end: np.ndarray  # (K,) int32
-    subject: np.ndarray  # (K,) int32, of the start where two subjects were combined
+    subject: np.ndarray  # (K,) int32; that of the start where two subjects were combined
     scale: np.ndarray  # (K,) millimetres per unit
-    seconds: np.ndarray  # (K,) how long it took; where two subjects were combined, the onset of the end
+    seconds: np.ndarray  # (K,) duration; where two subjects were combined, that of the second one's onset
 
-    def take(self, which: np.ndarray) -> Motions:
-        """The motions at indices, or under a mask."""
-        return Motions(*(field[which] for field in self))
+    def take(self, rows: np.ndarray) -> Motions:
+        """Return the motions at indices, or selected by a mask."""
+        return Motions(*(field[rows] for field in self))
 
     def millimetres(self) -> np.ndarray:
-        """The curves in millimetres."""
+        """Return the curves in millimetres, (K, T, L, 3)."""
         return self.curves * self.scale[:, None, None, None]
 
 
 def halves(
-    data: dataset.Dataset, split: str, *, label_names: Sequence[str] | None = None, frames: int = FRAMES, by: str = "time"
+    data: dataset.Dataset,
+    split: str,
+    *,
+    label_names: Sequence[str] | None = None,
+    frames: int = FRAMES,
+    by: str = "time",
 ) -> Motions:
-    """Every neutral -> peak and peak -> neutral motion of a split's subjects.
+    """Return every neutral -> peak and peak -> neutral motion of a split's subjects.
 
-    `label_names`: labels that count, neutral first, and their numbers; by default all of the dataset. `by`: frames evenly
-    spaced in "time", or along the "arc", which takes onset and apex away.
+    Args:
+      data: an open dataset.
+      split: "train", "validation" or "test".
+      label_names: labels to use, neutral first; `start` and `end` index them. By default all of the dataset.
+      frames: T.
+      by: resample uniformly in "time", or in arc length ("arc"), which removes the timing.
+
+    Raises:
+      ValueError: the split has no such motions, or another `by`.
     """
     label_names = data.labels if label_names is None else tuple(label_names)
     rows = []
@@ -55,13 +70,16 @@ def halves(
         rise = curve[sequence.onset : sequence.apex_start + 1]
         fall = curve[sequence.apex_end : sequence.offset + 1]
         for cut, start, end in ((rise, 0, label), (fall, label, 0)):
-            if len(cut) > 1:  # what begins or ends at its apex has one half
+            if len(cut) > 1:  # a recording that begins or ends at its apex has one half
                 rows.append((_resample(cut, frames, by), start, end, sequence.subject, scale, _seconds(sequence, cut)))
     return _stack(rows)
 
 
 def direct_transitions(data: dataset.Dataset, split: str, *, frames: int = FRAMES) -> Motions:
-    """The directly performed peak -> peak transitions of a split; no capture set has them, evaluation only."""
+    """Return the peak -> peak transitions of a split that were performed directly.
+
+    Only synthetic datasets have them, so that they serve evaluation alone. Raises `ValueError` where there are none.
+    """
     rows = []
     for sequence, curve, scale in recordings(data, split, direct=True):
         start, end = (data.labels.index(name) for name in sequence.label.split(">"))
@@ -82,12 +100,23 @@ def interpolated_transitions(
     frames: int = FRAMES,
     chunk: int = 4096,
 ) -> Iterator[Motions]:
-    """Peak -> peak transitions on the geodesics between onsets, `chunk` at a time: memory does not grow with them.
+    """Yield peak -> peak transitions along geodesics between onsets, in parts of at most `chunk` motions.
 
-    `per_pair` of each ordered pair of expressions; None: all. `choice`: "prototypes", the nearest to the mean peaks of
-    the two expressions (OT23; with `reuse`, no onset serves as the start, or as the end, of more than so many
-    transitions of one pair), or "spread", all people equally often. `time_warp` as in `augment.transitions`; `pairs`: the
-    (start, end) that are wanted.
+    Args:
+      onsets: neutral -> peak motions.
+      labels: number of labels, neutral included.
+      per_pair: transitions of each ordered pair of expressions; None for all.
+      reuse: with "prototypes", the number of transitions of one pair that an onset may start, or end; None for any.
+      choice: "prototypes" takes the peaks nearest to the mean peaks of the two expressions (OT23), "spread" uses all
+        subjects equally often.
+      time_warp: as in `augment.transitions`.
+      pairs: the (start, end) labels to return; None for all.
+      seed: of the draw for "spread".
+      frames: T.
+      chunk: bounds the memory.
+
+    Raises:
+      ValueError: another `choice`.
     """
     if choice not in ("prototypes", "spread"):
         raise ValueError(f'choice: expected "prototypes" or "spread", got {choice!r}')
@@ -108,24 +137,29 @@ def interpolated_transitions(
     return _between(onsets, motions, chosen, frames, time_warp, chunk)
 
 
-def _between(onsets: Motions, motions: augment.Motions, chosen, frames: int, pace: str, chunk: int):
+def _between(
+    onsets: Motions, motions: augment.Motions, chosen, frames: int, time_warp: str, chunk: int
+) -> Iterator[Motions]:
     for low in range(0, len(chosen), chunk):
         pairs = chosen[low : low + chunk]
-        curves = [np.asarray(c) for c in augment.transitions(motions, pairs, frames=frames, time_warp=pace)]
+        curves = [np.asarray(c) for c in augment.transitions(motions, pairs, frames=frames, time_warp=time_warp)]
         first, second = pairs.T
         own = (onsets.end[first], onsets.end[second], onsets.subject[first], onsets.scale[first])
         yield Motions(np.concatenate(curves), *own, onsets.seconds[second])
 
 
 def join(*parts: Motions) -> Motions:
-    """All motions, one after the other."""
+    """Concatenate motions."""
     return Motions(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
 def recordings(
     data: dataset.Dataset, split: str, *, direct: bool
 ) -> Iterator[tuple[dataset.Sequence, np.ndarray, float]]:
-    """Each sequence of a split, its displacements from neutral (T, L, 3), unitless, and the millimetres per unit."""
+    """Yield each sequence of a split with its unitless displacements (T, L, 3) and the millimetres per unit.
+
+    `direct` selects direct transitions, otherwise they are skipped.
+    """
     members = set(data.subjects(split).tolist())
     rest = data.neutral[:, data.landmark_index]
     for sequence in data.sequences:
@@ -141,16 +175,16 @@ def _seconds(sequence: dataset.Sequence, part: np.ndarray) -> float:
 
 
 def _resample(curve: np.ndarray, frames: int, by: str = "time") -> np.ndarray:
-    # In NumPy: every sequence has its own length, and a jitted function would compile for each.
+    # NumPy, because sequences differ in length and a jitted function would compile for each length.
     if by not in ("time", "arc"):
         raise ValueError(f'by: expected "time" or "arc", got {by!r}')
-    place = np.linspace(0, len(curve) - 1, frames)
+    position = np.linspace(0, len(curve) - 1, frames)
     if by == "arc":
         steps = np.linalg.norm(np.diff(curve.reshape(len(curve), -1), axis=0), axis=1)
-        covered = np.append(0, np.cumsum(steps + 1e-12))
-        place = np.interp(np.linspace(0, covered[-1], frames), covered, np.arange(len(curve)))
-    low = np.minimum(place.astype(int), len(curve) - 2)
-    weight = (place - low)[:, None, None].astype(np.float32)
+        arc_length = np.append(0, np.cumsum(steps + 1e-12))
+        position = np.interp(np.linspace(0, arc_length[-1], frames), arc_length, np.arange(len(curve)))
+    low = np.minimum(position.astype(int), len(curve) - 2)
+    weight = (position - low)[:, None, None].astype(np.float32)
     return curve[low] * (1 - weight) + curve[low + 1] * weight
 
 

@@ -1,4 +1,7 @@
-"""What generators of motion learn from: a dataset's transitions, the chart fitted to them, and motions in it."""
+"""Training data of the motion generators: a dataset's transitions, the chart fitted to them, and motions encoded in it.
+
+A chart is the tangent PCA of `facejax.models.motion.tangent_pca`. M motions, R directions of motion, D of poses.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from facejax.data import dataset, motions
 from facejax.geometry import sphere, srvf
 from facejax.models.motion import start_poses, tangent_pca
 
-MAX_RANK = 128  # directions of motion, where there are enough motions to tell
-TRANSITIONS_PER_PAIR = 48  # interpolated transitions of each ordered pair: with 12 labels about the 6,740 of OT23
-SPREAD_PER_PAIR = 400  # of each ordered pair where everybody meets everybody
-CHART_PER_PAIR = 80  # of each, that a chart is fitted on
+MAX_RANK = 128  # directions of motion, where there are enough motions to estimate them
+TRANSITIONS_PER_PAIR = 48  # interpolated transitions of each ordered pair; about the 6,740 of OT23 for 12 labels
+SPREAD_PER_PAIR = 400  # of each ordered pair in `all_pairs`
+CHART_PER_PAIR = 80  # of each ordered pair, for fitting a chart
 
 
 class Examples(NamedTuple):
-    """Motions in a chart's coordinates, as the networks see them."""
+    """Motions in the coordinates of a chart, the input of the networks."""
 
     values: np.ndarray  # (M, 2 + R)
     start: np.ndarray  # (M,)
@@ -37,9 +40,9 @@ def transitions(
     reuse: int | None = 1,
     time_warp: str = "performed",
 ) -> motions.Motions:
-    """OT23's set: halves, and the peak -> peak transitions nearest to the prototypes, between every two expressions.
+    """Return OT23's training set: halves, and for every two expressions the transitions nearest to the prototypes.
 
-    `label_names` as in `data.motions.halves`; `per_pair`, `reuse` and `time_warp` as in `data.motions.interpolated_transitions`.
+    `label_names` as in `motions.halves`; `per_pair`, `reuse` and `time_warp` as in `motions.interpolated_transitions`.
     """
     halves = motions.halves(data, split, label_names=label_names)
     onsets = halves.take(halves.start == 0)
@@ -58,20 +61,33 @@ def all_pairs(
     time_warp: str = "performed",
     seed: int = 0,
 ) -> Iterator[motions.Motions]:
-    """Halves, and unselected peak -> peak transitions in which everybody meets everybody, part by part."""
+    """Yield halves, then peak -> peak transitions between all subjects, without selection.
+
+    Arguments as in `transitions`.
+    """
     halves = motions.halves(data, split, label_names=label_names)
     yield halves
     onsets = halves.take(halves.start == 0)
     count = len(data.labels if label_names is None else label_names)
-    yield from motions.interpolated_transitions(onsets, count, per_pair=per_pair, choice="spread", time_warp=time_warp, seed=seed)
+    yield from motions.interpolated_transitions(
+        onsets, count, per_pair=per_pair, choice="spread", time_warp=time_warp, seed=seed
+    )
 
 
 def fit_chart(
     known: motions.Motions, *, labels: int, rank: int = 128, pose: int = 32, mean: str = "karcher"
 ) -> tangent_pca.TangentPCA:
-    """The chart of a training set, at the "karcher" mean of its motions, or their normalised "extrinsic" one.
+    """Fit the chart of a training set.
 
-    Its R = `rank` directions need more motions than that. Raises `ValueError` for labels beyond labels-1.
+    Args:
+      known: the motions.
+      labels: K, the number of labels.
+      rank: R; needs more motions than that.
+      pose: D.
+      mean: base point, the "karcher" mean of the motions or their normalised "extrinsic" mean.
+
+    Raises:
+      ValueError: a motion has a label above K - 1, or another `mean`.
     """
     if (highest := max(known.start.max(), known.end.max())) >= labels:
         raise ValueError(f"labels: expected more than {highest}, the highest label of the motions; got {labels}")
@@ -87,7 +103,7 @@ def fit_chart(
 
 
 def encode_examples(chart: tangent_pca.TangentPCA, parts: motions.Motions | Iterable[motions.Motions]) -> Examples:
-    """Motions in a chart's coordinates; parts are forgotten one after the other."""
+    """Encode motions in a chart. Parts are consumed one at a time, so that memory holds one of them."""
     rows = []
     for part in [parts] if isinstance(parts, motions.Motions) else parts:
         values, pose = _place(chart, part.curves, np.log(part.seconds), part.start, part.end)
@@ -96,15 +112,23 @@ def encode_examples(chart: tangent_pca.TangentPCA, parts: motions.Motions | Iter
 
 
 def balance_pairs(start: np.ndarray, end: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Row numbers in which every (start, end) occurs as often as the most frequent one, for training."""
+    """Return row numbers in which every (start, end) occurs as often as the most frequent one.
+
+    Args:
+      start: labels (M,).
+      end: labels (M,).
+      seed: of the order of rows.
+    """
     pair = np.asarray(start) * (max(start.max(), end.max()) + 1) + np.asarray(end)
-    most = np.bincount(pair).max()
+    count = np.bincount(pair).max()
     random = np.random.default_rng(seed)
-    return np.concatenate([np.resize(random.permutation(np.flatnonzero(pair == one)), most) for one in np.unique(pair)])
+    return np.concatenate(
+        [np.resize(random.permutation(np.flatnonzero(pair == one)), count) for one in np.unique(pair)]
+    )
 
 
 def fit_start_poses(chart: tangent_pca.TangentPCA, known: motions.Motions) -> start_poses.StartPoses:
-    """The peaks from which motions start when only a label is known, of the motions that start at one."""
+    """Fit the distribution of peak poses given a label, from the ends of the onsets in `known`."""
     peaks = known.take((known.start == 0) & (known.end > 0))
     poses = jax.vmap(tangent_pca.encode_pose, (None, 0, 0))(
         chart, jnp.asarray(peaks.curves[:, -1]), jnp.asarray(peaks.end)
@@ -113,9 +137,9 @@ def fit_start_poses(chart: tangent_pca.TangentPCA, known: motions.Motions) -> st
 
 
 def default_rank(known: motions.Motions) -> int:
-    """How many directions of motion to learn: a quarter as many as there are motions, where these are few.
+    """Return the number of directions to learn: a quarter of the motions, at most `MAX_RANK`.
 
-    In directions that few of them take, the flow strays.
+    In directions supported by few motions the flow model diverges from the data.
     """
     return min(MAX_RANK, len(known.start) // 4)
 

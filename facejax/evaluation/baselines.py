@@ -63,7 +63,7 @@ class LinearFit(NamedTuple):
     alpha: float  # mm^2
 
 
-class Rest(NamedTuple):
+class StaticTopology(NamedTuple):
     """What methods that learn nothing know."""
 
     faces: np.ndarray
@@ -170,18 +170,18 @@ def _apply_neural(
     return neutral + fit_neural3dmm.apply(fitted, displacements, neutral)
 
 
-def _rest(train: MeshSubset, folder: Path, options: Options) -> Rest:
-    return Rest(np.asarray(train.data.faces), np.asarray(train.data.landmark_index))
+def _rest(train: MeshSubset, folder: Path, options: Options) -> StaticTopology:
+    return StaticTopology(np.asarray(train.data.faces), np.asarray(train.data.landmark_index))
 
 
-def _apply_rbf(known: Rest, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_rbf(known: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     points = np.asarray(neutral, np.float64)[known.landmark_index]
     lips = rbf_weights.IBUG_LIPS if len(points) == 68 else None
     weights = rbf_weights.weights(np.asarray(neutral, np.float64), known.faces, points, lips=lips)
     return neutral + np.asarray(rbf.warp(weights, displacements))
 
 
-def _apply_still(known: Rest, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_still(known: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     return np.broadcast_to(neutral, (len(displacements), *np.shape(neutral)))
 
 

@@ -20,22 +20,22 @@ MEAN_OVER_RMS = np.sqrt(8 / (3 * np.pi))
 
 
 def nearest_pairs(
-    landmarks: np.ndarray, group: np.ndarray, *, apart: np.ndarray | None = None, alike: bool = False,
+    landmarks: np.ndarray, group: np.ndarray, *, recording: np.ndarray | None = None, within_groups: bool = False,
     count: int = NEIGHBOURS,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Pairs (P, 2) of near frames by their landmarks (F, L, 3), and the squared distances (P,).
 
-    Of different groups (F,), people say; or `alike`, of one group but not of one and the same `apart` (F,), a recording
+    Of different groups (F,), people say; or `within_groups`, of one group but not of one and the same `recording` (F,), a recording
     say. The `count` nearest such frames of each.
     """
     flat = np.asarray(landmarks, np.float64).reshape(len(landmarks), -1)
     found = []
-    if alike:
-        if apart is None:
+    if within_groups:
+        if recording is None:
             raise ValueError("pairs within a group need `apart`: frames of one recording are no two samples")
         for value in np.unique(group):
             mine = np.flatnonzero(group == value)
-            found.append(mine[_nearest(flat[mine], apart[mine], count)])
+            found.append(mine[_nearest(flat[mine], recording[mine], count)])
     else:
         found.append(_nearest(flat, group, count))
     both = np.concatenate(found)
@@ -44,15 +44,15 @@ def nearest_pairs(
     return both, np.sum((flat[both[:, 0]] - flat[both[:, 1]]) ** 2, axis=1)
 
 
-def estimate(left: np.ndarray, both: np.ndarray, squared: np.ndarray) -> np.ndarray:
+def estimate(residuals: np.ndarray, pairs: np.ndarray, squared_distances: np.ndarray) -> np.ndarray:
     """The floor (N,) in mm, mean distance per vertex, of what a map left over (F, N, 3), from `nearest_pairs`."""
-    gaps = np.zeros((len(both), left.shape[1]), np.float32)
-    for low in range(0, len(both), 256):
-        some = both[low : low + 256]
-        gaps[low : low + 256] = 0.5 * np.sum((left[some[:, 0]] - left[some[:, 1]]) ** 2, axis=-1)
+    gaps = np.zeros((len(pairs), residuals.shape[1]), np.float32)
+    for low in range(0, len(pairs), 256):
+        some = pairs[low : low + 256]
+        gaps[low : low + 256] = 0.5 * np.sum((residuals[some[:, 0]] - residuals[some[:, 1]]) ** 2, axis=-1)
     # Near pairs say most about distance zero, and far ones pull the line: the nearer half decides.
-    near = squared <= np.median(squared)
-    x, y = squared[near], gaps[near].astype(np.float64)
+    near = squared_distances <= np.median(squared_distances)
+    x, y = squared_distances[near], gaps[near].astype(np.float64)
     slope = (x - x.mean()) @ (y - y.mean(axis=0)) / max(np.sum((x - x.mean()) ** 2), 1e-12)
     # A variance is not negative, and not below zero's slope: distance does not make meshes more alike.
     variance = np.where(slope > 0, y.mean(axis=0) - slope * x.mean(), y.mean(axis=0))

@@ -12,7 +12,7 @@ from facejax.data import dataset, mesh_subset
 from facejax.data.mesh_subset import Batch, MeshSubset
 from facejax.inference import pipeline
 
-EDGES = np.geomspace(1e-5, 20.0, 253)  # mm, of cumulative curves: forty a decade
+BIN_EDGES = np.geomspace(1e-5, 20.0, 253)  # mm, of cumulative curves: forty a decade
 
 
 class Distances(NamedTuple):
@@ -76,8 +76,8 @@ def _summed(pairs: Iterable[Batch], regions: dict[str, np.ndarray]) -> Distances
     found = None
     for made, true in pairs:
         off = np.linalg.norm(made - true, axis=-1).astype(np.float64)
-        bins = np.searchsorted(EDGES, off)
-        counts = [np.bincount(bins[:, mask].ravel(), minlength=len(EDGES) + 1) for mask in regions.values()]
+        bins = np.searchsorted(BIN_EDGES, off)
+        counts = [np.bincount(bins[:, mask].ravel(), minlength=len(BIN_EDGES) + 1) for mask in regions.values()]
         mine = Distances(len(off), off.sum(axis=0), (off**2).sum(axis=0), np.stack(counts))
         found = mine if found is None else found.add(mine)
     if found is None:
@@ -85,7 +85,7 @@ def _summed(pairs: Iterable[Batch], regions: dict[str, np.ndarray]) -> Distances
     return found
 
 
-def of_models(models: pipeline.Models, data: dataset.Dataset, *splits: str) -> dict[str, float]:
+def model_errors(models: pipeline.Models, data: dataset.Dataset, *splits: str) -> dict[str, float]:
     """Mean vertex error in mm by region on the people of splits, else on all held out; empty where nobody is."""
     held = [split for split in splits or ("validation", "test") if len(data.subjects(split))]
     if not held:

@@ -1,15 +1,14 @@
-"""Expression networks ready to use: a name in, the motion of the landmarks out (Seo and Luo 2021).
+"""Released expression networks: from the name of an expression to the motion of the landmarks (SL21).
 
     networks = expressions.load()
     curve = expressions.displacements(networks, "anger")  # (T, 68, 3)
 
-Curves are displacements from neutral, unitless: divided by the norm of the face's neutral landmarks about their
-centroid, in its own frame (y up, z forward). `facejax.animation` puts them on a mesh.
+E expressions, T frames, L landmarks. Curves are displacements from neutral, unitless: divided by the norm of the
+centred neutral landmarks, in the face's frame (y up, z forward). `inference.retarget` applies them to a mesh.
 """
 
 from __future__ import annotations
 
-import difflib
 import os
 from importlib import resources
 from typing import Any, NamedTuple
@@ -18,11 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from facejax.inference import checks
 from facejax.io import weights
 from facejax.models import expression_lstm
 
 RELEASED = "expressions.safetensors"
-STOP = 0.01  # share of the greatest energy below which an expression that has come home is over
+STOP = 0.01  # an expression has ended when its energy falls below this fraction of the maximum
 
 
 class Expressions(NamedTuple):
@@ -32,12 +32,12 @@ class Expressions(NamedTuple):
     params: expression_lstm.ExpressionLSTM  # stacked, (E, ...)
     config: expression_lstm.Config
     rate: float  # frames per second
-    frames: int  # of the longest sequence that they learnt from, its tail included
-    about: dict[str, Any]  # how they were made
+    frames: int  # of the longest training sequence, its tail included
+    about: dict[str, Any]  # provenance
 
 
 def load(path: str | os.PathLike | None = None) -> Expressions:
-    """The released networks, or those of a file. Raises `weights.WeightsError`."""
+    """Read the released networks, or those of a file. Raises `weights.WeightsError`."""
     path = path or resources.files("facejax.assets").joinpath(RELEASED)
     about = weights.load_metadata(path)
     try:
@@ -52,7 +52,7 @@ def load(path: str | os.PathLike | None = None) -> Expressions:
 
 
 def save(path: str | os.PathLike, networks: Expressions) -> None:
-    """Write networks to one safetensors file, in half precision: curves change by 2 parts in 10,000."""
+    """Write networks to one safetensors file, in half precision: curves change by a relative 2e-4."""
     halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), networks.params.weights)
     described = {
         "labels": list(networks.labels),
@@ -65,11 +65,8 @@ def save(path: str | os.PathLike, networks: Expressions) -> None:
 
 
 def network(networks: Expressions, label: str) -> expression_lstm.ExpressionLSTM:
-    """The network of one expression. Raises `ValueError` with the nearest names for one that has none."""
-    if label not in networks.labels:
-        near = difflib.get_close_matches(label, networks.labels, n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(near)}?" if near else f"there are {', '.join(networks.labels)}"
-        raise ValueError(f"no network for the expression {label!r}: {hint}")
+    """Return the network of one expression. Raises `ValueError` for an unknown name, with the closest ones."""
+    checks.check_expression(label, networks.labels)
     at = networks.labels.index(label)
     return jax.tree.map(lambda leaf: leaf[at], networks.params)
 
@@ -83,19 +80,26 @@ def displacements(
     prefix: np.ndarray | jax.Array | None = None,
     stop: float = STOP,
 ) -> jax.Array:
-    """The motion of an expression, (T, L, 3) or (..., T, L, 3), unitless, from neutral on.
+    """Generate the motion of an expression from neutral, (T, L, 3) or (..., T, L, 3), unitless.
 
-    `neutral` (..., L, 3) are the face's landmarks at rest, in any unit: networks that start from the neutral face need
-    them, others pass them over. `prefix` (..., P, L, 3), unitless, is a beginning to go on from. Ends when the
-    expression is over (`sequence.ending`; with several faces, the last one's), at the latest after `frames`; with
-    `stop` 0 there. Raises `ValueError` for an unknown label or a wrong shape.
+    Args:
+      neutral: (..., L, 3) landmarks at rest in any unit; needed by networks that start from the neutral face, ignored
+        by others.
+      frames: maximal length; default: that of the longest training sequence.
+      prefix: (..., P, L, 3) unitless first frames to continue.
+      stop: the motion ends at `expression_lstm.expression_length` of this fraction (of several faces, the last one's);
+        0: after `frames`.
+
+    Raises:
+      ValueError: an unknown label or a wrong shape.
     """
     params, first = network(networks, label), None
     frames = networks.frames if frames is None else frames
     shape = (networks.config.landmarks, 3)
     if networks.config.start == "neutral":
         if neutral is None or np.shape(neutral)[-2:] != shape:
-            raise ValueError(f"neutral: these networks need landmarks at rest, (..., {shape[0]}, 3)")
+            got = None if neutral is None else np.shape(neutral)
+            raise ValueError(f"neutral: expected landmarks at rest (..., {shape[0]}, 3), got {got}")
         centred = jnp.asarray(neutral) - jnp.mean(jnp.asarray(neutral), axis=-2, keepdims=True)
         first = centred / jnp.sqrt(jnp.sum(centred**2, axis=(-2, -1), keepdims=True))
     if not 0 <= stop < 1:
@@ -109,7 +113,7 @@ def displacements(
 
 
 def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.ExpressionLSTM:
-    """Shapes and dtypes of a file's tree."""
+    """Return the tree of shapes and dtypes that a file holds."""
     size = config.landmarks * 3
     basis = None if config.components is None else jnp.zeros((size, config.components))
     scale = expression_lstm.Scale(jnp.ones(()), jnp.zeros((config.landmarks, 3)), jnp.ones(()), jnp.ones(()), basis)

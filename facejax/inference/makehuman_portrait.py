@@ -1,6 +1,6 @@
-"""A posed MakeHuman head with its own eyes, teeth and tongue, for pictures.
+"""Eyes, teeth and tongue of posed MakeHuman heads, for rendering.
 
-T frames, M vertices: skin first, then the props (`facejax.data.rig.pose`). Millimetres.
+T frames, M vertices: skin first, then eyes, teeth and tongue (`data.synthetic.rig.pose`). Millimetres.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 
 from facejax.data.synthetic import assets, contact
-from facejax.viz import eyes_teeth, props, scene
+from facejax.viz import eyes_teeth, scene
 
 
 def parts(posed: np.ndarray) -> tuple[scene.Part, ...]:
-    """What stands beside the skin of heads (T, M, 3): eyeballs, front teeth, tongue."""
+    """Return the parts beside the skin of heads (T, M, 3): eyeballs, front teeth, tongue."""
     loaded = assets.load()
     found = []
     for name, triangles in loaded.prop_faces.items():
@@ -21,11 +21,11 @@ def parts(posed: np.ndarray) -> tuple[scene.Part, ...]:
         if name.endswith("eye"):
             centres, radii = zip(*(contact.fit_sphere(frame[used].astype(np.float64)) for frame in posed), strict=True)
             centre, radius = np.array(centres) - [0, 0, 0.3], float(radii[0])
-            found.append(props.eyeball(centre, radius - 0.5, iris_radius=0.4 * radius))
+            found.append(eyes_teeth.eyeball(centre, radius - 0.5, iris_radius=0.4 * radius))
             continue
         if "teeth" in name:
-            shown, local = eyes_teeth.front(loaded.base[used], local)
+            shown, local = eyes_teeth.front_teeth(loaded.base[used], local)
             used = used[shown]
-        colour = props.TONGUE if "tongue" in name else props.TEETH
+        colour = eyes_teeth.TONGUE_COLOUR if "tongue" in name else eyes_teeth.TEETH_COLOUR
         found.append(scene.Part(posed[:, used], local, colour, 0.6))
     return tuple(found)

@@ -1,6 +1,7 @@
-"""What moves a face: an expression network, transitions between labels, or a person's recording.
+"""Sources of motion: an expression network, generated transitions between labels, or a recording.
 
-Each gives a `Motion` of the template's 68 landmarks, to be put on a mesh by `facejax.animation`.
+Each returns a `Motion` of the template's 68 landmarks; `inference.retarget` applies it to a mesh.
+T frames, L landmarks, M vertices of a posed MakeHuman head.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from facejax.data.synthetic import makehuman, rig
 from facejax.inference import expressions, pipeline
 from facejax.io import livelink
 
-NATURAL = "natural"  # as many frames as people take
-LEVEL = 3  # of the rig that a recording drives
+NATURAL = "natural"  # `frames`: the durations that are generated with the motion
+LEVEL = 3  # realism of the rig that plays recordings
 
 
 class Motion(NamedTuple):
-    """T frames of L landmarks."""
+    """A landmark motion, ready to be applied to a face."""
 
     curve: np.ndarray  # (T, L, 3) displacements from neutral in the template's frame, unitless
     name: str  # for files
@@ -38,10 +39,17 @@ def from_expression(
     whole: bool = False,
     weights: Path | None = None,
 ) -> Motion:
-    """An expression network's own motion; `whole`: up to the last frame, though the expression is over before.
+    """Generate a motion with an expression network.
 
-    `neutral` (68, 3): landmarks at rest, for networks that start from them; by default the average face's. Raises
-    `ValueError` for an expression without a network, and `weights.WeightsError`.
+    Args:
+      neutral: (68, 3) landmarks at rest, for networks that start from them; default: the average face's.
+      frames: maximal length.
+      whole: keep all frames, also those after the expression has ended.
+      weights: file of networks; default: the released ones.
+
+    Raises:
+      ValueError: there is no network for the expression.
+      WeightsError: the file cannot be used.
     """
     networks = expressions.load(weights)
     stop = 0.0 if whole else expressions.STOP
@@ -55,9 +63,9 @@ def from_expression(
 def from_labels(
     labels: Sequence[str], *, seed: int = 7, frames: int | Sequence[int] | str = 30, weights: Path | None = None
 ) -> Motion:
-    """A generated motion through two or more labels; `frames` as in `pipeline.landmarks`, or "natural".
+    """Generate a motion through two or more labels; `frames` as of `pipeline.landmarks`, or "natural".
 
-    Raises as `pipeline.displacements`.
+    Raises `ValueError` as `pipeline.displacements` does.
     """
     models = pipeline.load(weights)
     if frames == NATURAL:
@@ -67,7 +75,7 @@ def from_labels(
 
 
 def from_recording(recording: livelink.Recording, *, name: str) -> Motion:
-    """The motion of the average face under a recording that is evenly sampled (`livelink.resample`)."""
+    """Return the landmark motion of the average face that plays an evenly sampled recording (`livelink.resample`)."""
     person, marks = makehuman.average(), makehuman.template().landmarks
     rest = person.vertices[marks]
     scale = float(np.linalg.norm(rest - rest.mean(axis=0)))
@@ -78,37 +86,43 @@ def from_recording(recording: livelink.Recording, *, name: str) -> Motion:
 def read_recording(
     path: Path, *, begin: float = 0.0, seconds: float = 10.0, rate: float = 30.0, at_rest: bool = True
 ) -> livelink.Recording:
-    """A part of a Live Link Face recording, evenly sampled; with `at_rest`, relative to the person's own resting face.
+    """Read a part of a Live Link Face recording, resampled to `rate` frames per second.
 
-    Raises `livelink.RecordingError` for a damaged file, and where nothing was recorded at that time.
+    Args:
+      begin, seconds: start time and duration.
+      at_rest: subtract the weights of the person's resting face.
+
+    Raises:
+      ValueError: a negative start, or no duration.
+      RecordingError: a damaged file, or no frames at that time.
     """
     if not (seconds > 0 and begin >= 0):
-        raise ValueError(f"expected a beginning of 0 or later and more than 0 seconds, got {begin:g} and {seconds:g}")
+        raise ValueError(f"expected begin of 0 or more and seconds above 0, got {begin:g} and {seconds:g}")
     whole = livelink.read(path)
     if at_rest:
-        # From the whole recording: a part of it may never rest.
+        # Estimated from the whole recording: the selected part may contain no resting face.
         whole = livelink.subtract_rest(whole)
     even = livelink.resample(whole, rate=rate)
     length = float(even.times[-1])
     chosen = (even.times >= begin - 1e-9) & (even.times < begin + seconds - 1e-9)
     if chosen.sum() < 2:
-        raise livelink.RecordingError(f"{path}: has nothing at {begin:g} s; it lasts {length:.1f} s")
+        raise livelink.RecordingError(f"{path}: no frames at {begin:g} s; the recording ends at {length:.1f} s")
     notes = list(even.notes)
     if chosen.sum() < len(chosen):
-        notes.append(f"took {chosen.sum() / rate:.1f} s from {begin:g} s on, of {length:.1f} s")
+        notes.append(f"used {chosen.sum() / rate:.1f} s of {length:.1f} s, from {begin:g} s on")
     times = even.times[chosen]
     gaps = tuple(gap for gap in even.gaps if times[0] <= gap[0] < times[-1])
     return livelink.Recording(even.weights[chosen], even.head[chosen], times - times[0], gaps, tuple(notes))
 
 
 def animate_person(recording: livelink.Recording, person: makehuman.Subject, *, intensity: float = 1.0) -> np.ndarray:
-    """A MakeHuman person under an evenly sampled recording, by blendshapes: skin, eyes and teeth, (T, M, 3) mm.
+    """Pose a MakeHuman person by the blendshape weights of an evenly sampled recording, times `intensity`.
 
-    `intensity` scales the weights.
+    Returns vertices (T, M, 3) of skin, eyes and teeth; mm.
     """
     return rig.pose(rig.build(person, level=LEVEL), intensity * livelink.unit_weights(recording, rig.unit_names()))
 
 
 def rate_of(recording: livelink.Recording) -> float:
-    """Frames per second of an evenly sampled recording."""
+    """Return the frames per second of an evenly sampled recording."""
     return float(1 / np.median(np.diff(recording.times)))

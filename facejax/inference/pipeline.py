@@ -1,22 +1,21 @@
-"""Inference composed: labels and a neutral face in, landmarks and meshes out.
+"""Inference: from labels and a neutral face to landmarks and meshes.
 
     models = pipeline.load()
     landmarks = pipeline.landmarks(models, key, ["neutral", "high_smile", "neutral"], neutral)
     vertices = pipeline.meshes(models, landmarks, neutral)
 
-Millimetres. A neutral face is (N, 3) vertices in the models' topology; T frames, L landmarks, S samples.
+T frames, N vertices, L landmarks, S samples; millimetres. A neutral face is (N, 3) vertices in the models' topology.
 """
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax.inference import composition
+from facejax.inference import checks, composition
 from facejax.models.bundle import Face, Models, load, save
 from facejax.models.decoders import gpmm_residual, s2d_dec
 
@@ -37,8 +36,8 @@ __all__ = [
     "save",
 ]
 
-RATE = 30.0  # frames per second at which motions are played
-FRAMES = 30  # of a transition, as the generator learnt them
+RATE = 30.0  # frames per second of generated motions
+FRAMES = 30  # of a transition, as in the generator's training data
 
 
 def landmarks(
@@ -51,16 +50,19 @@ def landmarks(
     frames: int | Sequence[int] = FRAMES,
     intensity: float = 1.0,
 ) -> jax.Array:
-    """Landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`.
+    """Generate the landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`; mm.
 
-    `frames` is the length of one transition, or one number for each; T = 1 + sum of (frames - 1), joints not repeated.
-    `durations` gives natural ones. A motion that does not start at neutral starts at a peak drawn for it
-    (`facejax.models.starts`), scaled to the face. `intensity` scales all displacements from neutral.
+    Args:
+      labels: two or more names; a motion that does not start at neutral starts at a peak drawn from `models.starts`.
+      neutral: (N, 3) vertices; mm.
+      frames: the length of every transition, or one for each; T = 1 + sum of (frames - 1), joints are not repeated.
+        `durations` gives natural ones.
+      intensity: scale of all displacements from neutral, 0 to 2.
 
-    Raises `ValueError` for an unknown label, a wrong vertex count, or options out of range.
+    Raises:
+      ValueError: an unknown label, another vertex count, or an option out of range.
     """
-    if not 0 <= intensity <= 2:
-        raise ValueError(f"intensity must lie in 0..2, got {intensity}")
+    checks.check_intensity(intensity)
     rest = neutral_landmarks(models, neutral)
     unitless = displacements(models, key, labels, samples=1 if samples is None else samples, frames=frames)
     moved = rest + intensity * jnp.linalg.norm(rest - rest.mean(axis=0)) * unitless
@@ -70,16 +72,17 @@ def landmarks(
 def displacements(
     models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int | Sequence[int] = FRAMES
 ) -> jax.Array:
-    """Displacements from neutral (S, T, L, 3) through `labels`, unitless: divided by the face's landmark norm."""
+    """Generate displacements from neutral (S, T, L, 3), unitless: divided by the norm of the centred landmarks."""
     numbers = _numbers(models, labels)
     each = lengths(labels, frames)
     return composition.compose(models.motion, models.starts, key, numbers, samples=samples, frames=each)
 
 
 def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: float = RATE) -> tuple[int, ...]:
-    """How many frames each transition takes at `rate` frames per second, as people perform it.
+    """Generate the natural number of frames of each transition at `rate` frames per second.
 
-    Generated with the motion: give `landmarks` the same key, and these as its `frames`. Of several samples, the first.
+    They belong to the first sample of the motion that `landmarks` generates from the same key; pass them as its
+    `frames`. Raises `ValueError` for a rate that is not positive, and for unknown labels.
     """
     if not rate > 0:
         raise ValueError(f"rate must be above 0 frames per second, got {rate}")
@@ -90,7 +93,7 @@ def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: fl
 
 
 def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ...]:
-    """One length for each transition. Raises `ValueError` for another number of them, or fewer than two frames."""
+    """Return the frames of each transition. Raises `ValueError` for a wrong count or fewer than two frames."""
     count = len(labels) - 1
     found = (frames,) * count if np.ndim(frames) == 0 else tuple(frames)
     if len(found) != count:
@@ -108,10 +111,15 @@ def meshes(
     refined: bool = True,
     noise: float | None = 0.0,
 ) -> jax.Array:
-    """Landmarks (..., T, L, 3) of a face and its neutral vertices (N, 3) -> vertices (..., T, N, 3).
+    """Decode landmarks (..., T, L, 3) of a face with neutral vertices (N, 3) to vertices (..., T, N, 3); mm.
 
-    Without `refined` the linear answer alone, much faster and little worse; `noise` tells by how many mm landmarks are
-    off, such as those of a detector; None finds it out. Both as in `expand.apply`; S2D-Dec refuses `noise`.
+    Args:
+      refined: False returns the GPMM estimate without the residual decoder: much faster, little worse.
+      noise: standard deviation of the landmarks in mm, such as a detector's; None estimates it. See
+        `gpmm_residual.apply`.
+
+    Raises:
+      ValueError: another vertex or landmark count, or `noise` for an S2D-Dec, which does not support it.
     """
     rest = neutral_landmarks(models, neutral)
     if landmarks.shape[-2:] != rest.shape:
@@ -121,21 +129,21 @@ def meshes(
             models.decoder, landmarks - rest, neutral, refined=refined, noise=noise
         )
     if noise != 0:
-        raise ValueError("noise: S2D-Dec cannot be told of it; the best linear answer can (`facejax.expand`)")
+        raise ValueError("noise is not supported by S2D-Dec; use a GPMM decoder (`models.decoders.gpmm_residual`)")
     return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
 
 
 def captions(labels: Sequence[str], *, frames: int | Sequence[int] = FRAMES) -> tuple[tuple[int, str], ...]:
-    """(first frame, "neutral → high_smile") of each transition."""
+    """Return (first frame, "neutral → high_smile") of each transition."""
     begins = np.cumsum([0] + [count - 1 for count in lengths(labels, frames)])
     pairs = zip(labels[:-1], labels[1:], strict=True)
     return tuple((int(begin), f"{start} → {end}") for begin, (start, end) in zip(begins, pairs, strict=False))
 
 
 def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Array:
-    """The landmarks (L, 3) of a neutral face (N, 3).
+    """Return the landmarks (L, 3) of a neutral face (N, 3); mm.
 
-    Raises `ValueError` for another vertex count, or a size that no head has in millimetres.
+    Raises `ValueError` for another vertex count, or a size that is not a head's in millimetres.
     """
     expected = models.face.vertices.shape
     if np.shape(neutral) != expected:
@@ -153,29 +161,15 @@ def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Ar
 
 
 def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
-    """Indices of label names. Raises `ValueError` with the nearest names for an unknown one."""
-    _check_names(labels)
-    for name in labels:
-        if name not in models.labels:
-            near = difflib.get_close_matches(name, models.labels, n=3, cutoff=0.4)
-            hint = f"did you mean {', '.join(near)}?" if near else f"there are {', '.join(models.labels)}"
-            raise ValueError(f"unknown label {name!r}: {hint}")
+    """Return the indices (K,) of label names. Raises `ValueError` for an unknown name, with the closest ones."""
+    checks.check_labels(labels, models.labels)
     return np.array([models.labels.index(name) for name in labels], np.int32)
 
 
-def _check_names(labels: Sequence[str]) -> None:
-    if isinstance(labels, str):
-        raise ValueError(f"labels: expected a sequence of names, got the one name {labels!r}")
-
-
-def _numbers(models: Models, labels: Sequence[str]) -> np.ndarray:
-    _check_names(labels)
-    for before, after in zip(labels[:-1], labels[1:], strict=True):
-        if before == after:
-            raise ValueError(f"labels: {before!r} follows itself; a transition needs two different labels")
-    if len(labels) < 2:
-        raise ValueError(f"labels: expected at least a start and an end, got {list(labels)}")
-    return label_indices(models, labels)
+def _numbers(models: Models, labels: Sequence[str]) -> list[int]:
+    """Return the indices of two or more labels, no two in a row alike."""
+    checks.check_transitions(labels)
+    return label_indices(models, labels).tolist()
 
 
 @jax.jit

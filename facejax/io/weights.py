@@ -4,6 +4,8 @@ A file holds raw arrays and a JSON header, and no code. Leaves are named by thei
 `weights/blocks/0/kernel`. Loading needs a tree of the expected shapes (`jax.eval_shape` of an `init` gives
 one for free) and checks names, shapes and dtypes against it, so that a file of another model or version
 never loads in part.
+
+JAX is imported inside functions, so that `load_metadata` answers without it.
 """
 
 import json

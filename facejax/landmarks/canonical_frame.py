@@ -16,7 +16,7 @@ from facejax.geometry import align
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "decimetres": 100.0, "metres": 1000.0}
 SIZE_RANGE = (0.6, 1.7)  # of a face against the template, adult heads and children's
-ALIKE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
+MAX_SHAPE_DISTANCE = 0.22  # distance from the template's shape; people have up to 0.11, left and right confused gives 0.24 and more
 HEAD_RANGE = (100.0, 400.0)  # mm, the longest side of a head, or of a face alone, from chin to brow
 
 
@@ -60,12 +60,12 @@ def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> 
     marks = topology.landmark_index
     turn = _axes(vertices[marks], topology.vertices[marks], name)
     notes += axes_note(turn)
-    millimetres, unit = unit_of(spread(vertices[marks]) / spread(topology.vertices[marks]), name)
+    millimetres, unit = infer_unit(centred_norm(vertices[marks]) / centred_norm(topology.vertices[marks]), name)
     notes += [f"read as {unit}"] if unit != "millimetres" else []
     return Face((vertices @ turn.T * millimetres).astype(np.float32), tuple(notes))
 
 
-def place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
+def align_to_template(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
     """Rotation (3, 3) from the template's landmarks (C, 3) to a mesh's, and the mesh's size against the template's.
 
     Raises `ValueError` where the two are not alike.
@@ -75,9 +75,9 @@ def place(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
     shape, target = (s.astype(np.float32) for s in shapes)
     fit = align.procrustes(target, shape, scaling=True)
     off = float(np.linalg.norm(np.asarray(align.apply(fit, target)) - shape))
-    if off > ALIKE:
+    if off > MAX_SHAPE_DISTANCE:
         raise ValueError(
-            f"its {len(points)} landmarks do not form a face (distance {off:.3f} of at most {ALIKE}): are they "
+            f"its {len(points)} landmarks do not form a face (distance {off:.3f} of at most {MAX_SHAPE_DISTANCE}): are they "
             "in the order of the scheme, left and right as the subject has them?"
         )
     return np.asarray(fit.rotation, np.float64), spread / wanted
@@ -89,7 +89,7 @@ def template68() -> np.ndarray:
         return np.load(stream, allow_pickle=False).astype(np.float64)
 
 
-def unit_of(size: float, name: str) -> tuple[float, str]:
+def infer_unit(size: float, name: str) -> tuple[float, str]:
     """Millimetres of the unit in which a face of `size`, against the template's in millimetres, is a head's; its name.
 
     Raises `FaceError` where it is none.
@@ -102,7 +102,7 @@ def unit_of(size: float, name: str) -> tuple[float, str]:
     )
 
 
-def unit_of_head(size: float, name: str) -> tuple[float, str]:
+def infer_head_unit(size: float, name: str) -> tuple[float, str]:
     """The same for a whole mesh, by the longest side of the box around it, where no landmarks are comparable."""
     for unit, millimetres in UNITS.items():
         if HEAD_RANGE[0] <= size * millimetres <= HEAD_RANGE[1]:
@@ -113,7 +113,7 @@ def unit_of_head(size: float, name: str) -> tuple[float, str]:
     )
 
 
-def turns() -> list[np.ndarray]:
+def axis_rotations() -> list[np.ndarray]:
     """The 24 rotations (3, 3) that permute the axes."""
     found = []
     for order in itertools.permutations(range(3)):
@@ -126,23 +126,23 @@ def turns() -> list[np.ndarray]:
 
 
 def axes_note(turn: np.ndarray) -> list[str]:
-    """What to say of a turn, one of `turns`: nothing where all stays as it is."""
+    """What to say of a turn, one of `axis_rotations`: nothing where all stays as it is."""
     if np.array_equal(turn, np.eye(3)):
         return []
     return [f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"]
 
 
-def spread(points: np.ndarray) -> float:
+def centred_norm(points: np.ndarray) -> float:
     """The norm of points (K, 3) about their centroid."""
     return float(np.linalg.norm(points - points.mean(axis=0)))
 
 
 def _axes(points: np.ndarray, target: np.ndarray, name: str) -> np.ndarray:
     """Of the 24 rotations that permute the axes, the one under which the landmarks look most like the template's."""
-    if spread(points) == 0:
+    if centred_norm(points) == 0:
         raise FaceError(f"{name}: all landmarks coincide: this is no face")
-    shape, wanted = ((p - p.mean(axis=0)) / spread(p) for p in (points, target))
-    nearest = min(turns(), key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
+    shape, wanted = ((p - p.mean(axis=0)) / centred_norm(p) for p in (points, target))
+    nearest = min(axis_rotations(), key=lambda turn: np.linalg.norm(shape @ turn.T - wanted))
     best = np.linalg.norm(shape @ nearest.T - wanted)
     if best > 0.6:
         raise FaceError(

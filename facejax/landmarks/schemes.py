@@ -147,7 +147,7 @@ def common(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
     return index[:, 0], index[:, 1]
 
 
-def other_side(point: str) -> str:
+def mirror_name(point: str) -> str:
     """The name of a point's mirror image."""
     side, _, rest = point.partition(" ")
     return {"left": f"right {rest}", "right": f"left {rest}"}.get(side, point)
@@ -158,7 +158,7 @@ def _build(count: int) -> Scheme:
     name, points = _SCHEMES[count]
     words = [set(point.split()) for point in points]
     groups = {group: _index(i for i, w in enumerate(words) if w & set(_WORDS[group])) for group in GROUPS}
-    mirror = _index(points.index(other_side(point)) for point in points)
+    mirror = _index(points.index(mirror_name(point)) for point in points)
     return Scheme(name, points, groups, mirror, _index(i for i, point in enumerate(points) if point in _STABLE))
 
 

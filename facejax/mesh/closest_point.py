@@ -1,34 +1,53 @@
-"""The nearest points of a surface, and what holds there. V vertices, F triangles, P points, in one unit."""
+"""Exact closest points on a triangle mesh, and interpolation of vertex values there.
+
+V vertices, F triangles, P points, in one unit. Works on the host, in float64.
+
+The search (`closest_points`) is exact. A triangle lies within a disc: its plane, its centroid, and the distance of the
+farthest corner as radius. The distance to that disc bounds the distance to the triangle from below, and triangles
+beyond the best distance so far are skipped. Triangles are grouped by radius, within a factor of two, each group with a
+k-d tree of centroids: a group is finished when its next centroid is farther than the best distance plus the largest
+radius.
+"""
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
 from facejax.mesh import graph
+from facejax.mesh.normals import vertex_normals_host
 
-CANDIDATES = 12  # triangles looked at for each point: those of the nearest samples
-FINE = 24_000  # samples of a surface at least: a large triangle gets several
-TILT = 5.0  # mm that a normal counts as in the search for what looks the same way: opposite ones lie twice as far apart
+NEIGHBOURS = 8  # centroids of a group that each point is compared with first; for most points of a scan, all it needs
+PAIRS = 1 << 20  # of points and triangles, about, that are compared at once
+
+
+class Group(NamedTuple):
+    """Triangles of similar size."""
+
+    tree: cKDTree  # of centroids
+    triangles: np.ndarray  # (G,) indices into the faces
+    radius: float  # the largest distance of a corner from its triangle's centroid
 
 
 class Surface(NamedTuple):
-    """A mesh that is asked for nearest points."""
+    """A mesh with the tables of a closest-point search."""
 
     vertices: np.ndarray  # (V, 3) float64
     faces: np.ndarray  # (F, 3)
-    normals: np.ndarray  # (V, 3) unit, by area
+    normals: np.ndarray  # (V, 3) unit, weighted by area
     edge: np.ndarray  # (V,) bool: on the boundary
-    tree: cKDTree  # of samples
-    looking: cKDTree  # of samples and their normals: of two sheets that touch it knows one from the other
-    owner: np.ndarray  # the triangle of each sample
+    centroids: np.ndarray  # (F, 3)
+    radii: np.ndarray  # (F,)
+    planes: np.ndarray  # (F, 3) unit normals of the triangles, 0 for one without area
+    tree: cKDTree  # of all centroids
+    groups: tuple[Group, ...]  # from the largest triangles to the smallest
 
 
 class Hits(NamedTuple):
-    """What was found for P points."""
+    """Closest points of P points."""
 
     face: np.ndarray  # (P,)
     weights: np.ndarray  # (P, 3) barycentric
@@ -36,76 +55,121 @@ class Hits(NamedTuple):
     distance: np.ndarray  # (P,)
 
 
-def surface(vertices: np.ndarray, faces: np.ndarray, *, seed: int = 0) -> Surface:
-    """Make a surface ready. Its samples are the middles of triangles, and points drawn by area."""
+def surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    """Return the search tables of a mesh (V, 3), (F, 3). Raises `ValueError` for a mesh without area."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     corners = vertices[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(doubled, axis=1) / 2
+    area = np.linalg.norm(doubled, axis=1)
     if not area.sum() > 0:
         raise ValueError("the mesh has no area")
-    edge = graph.on_boundary(faces, len(vertices))
-    rng = np.random.default_rng(seed)
-    extra = rng.choice(len(faces), max(0, FINE - len(faces)), p=area / area.sum())
-    owner = np.concatenate([np.arange(len(faces)), extra])
-    u = np.sort(rng.random((len(extra), 2)), axis=1)
-    share = np.concatenate(
-        [np.full((len(faces), 3), 1 / 3), np.column_stack([u[:, 0], u[:, 1] - u[:, 0], 1 - u[:, 1]])]
-    )
-    samples = np.einsum("pk,pkx->px", share, corners[owner])
-    flat = doubled / np.maximum(2 * area, 1e-30)[:, None]
-    both = np.concatenate([samples, TILT * flat[owner]], axis=1)
-    return Surface(vertices, faces, normals(vertices, faces), edge, cKDTree(samples), cKDTree(both), owner)
+    centroids = corners.mean(axis=1)
+    radii = np.sqrt(((corners - centroids[:, None]) ** 2).sum(axis=2).max(axis=1))
+    octave = np.frexp(radii)[1] // 2
+    groups = []
+    for value in np.unique(octave)[::-1]:
+        members = np.flatnonzero(octave == value)
+        groups.append(Group(cKDTree(centroids[members]), members, float(radii[members].max())))
+    planes = doubled / np.maximum(area, 1e-30)[:, None]
+    normals, edge = vertex_normals_host(vertices, faces), graph.on_boundary(faces, len(vertices))
+    return Surface(vertices, faces, normals, edge, centroids, radii, planes, cKDTree(centroids), tuple(groups))
 
 
 def closest_points(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, turn: float = 0.0) -> Hits:
-    """The nearest point of the surface to each of `points` (P, 3).
+    """Return the closest point of the surface to each of `points` (P, 3).
 
-    With their `normals` (P, 3), a triangle that looks the other way counts as farther: by twice `turn`.
+    With their unit `normals` (P, 3), the triangle minimises distance + turn * (1 - cosine of the angle between the
+    normals): one that faces the other way counts as farther by twice `turn`, in the unit of the vertices.
     """
     points = np.asarray(points, np.float64)
-    near = on.tree.query(points, k=min(CANDIDATES, len(on.owner)))[1].reshape(len(points), -1)
-    if normals is not None:
-        alike = np.concatenate([points, TILT * normals], axis=1)
-        more = on.looking.query(alike, k=min(CANDIDATES, len(on.owner)))[1].reshape(len(points), -1)
-        near = np.concatenate([near, more], axis=1)
-    candidates = on.owner[near]
-    count = candidates.shape[1]
-    triangles = on.vertices[on.faces[candidates.reshape(-1)]]
-    found = trimesh.triangles.closest_point(triangles, np.repeat(points, count, axis=0))
-    found = found.reshape(len(points), count, 3)
-    distance = np.linalg.norm(found - points[:, None], axis=-1)
-    cost = distance
-    if normals is not None:
-        flat = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
-        cost = distance + turn * (1 - np.einsum("pkx,px->pk", flat.reshape(len(points), count, 3), normals))
-    best = np.argmin(cost, axis=1)
-    row = np.arange(len(points))
-    face, at = candidates[row, best], found[row, best]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weights = trimesh.triangles.points_to_barycentric(on.vertices[on.faces[face]], at)
-    bad = ~np.isfinite(weights).all(axis=1)  # a triangle without area
-    weights = np.clip(np.where(bad[:, None], 1 / 3, weights), 0, 1)
-    return Hits(face, weights / weights.sum(axis=1, keepdims=True), at, distance[row, best])
+    search = _Search(on, points, None if normals is None else np.asarray(normals, np.float64), turn)
+    search.visit_neighbours()
+    for group in on.groups:
+        search.visit(group)
+    at = np.einsum("pc,pcx->px", search.weights, on.vertices[on.faces[search.face]])
+    return Hits(search.face, search.weights, at, search.distance)
 
 
-def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3) float64 of vertices, by area; zero where there is none.
+class _Search:
+    """The best triangle so far of each point (P, 3)."""
 
-    As `ops.vertex_normals`, without a compilation for every new mesh.
+    def __init__(self, on: Surface, points: np.ndarray, normals: np.ndarray | None, turn: float):
+        self.on, self.points, self.normals, self.turn = on, points, normals, turn
+        self.face, self.weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
+        self.distance, self.cost = np.full((2, len(points)), np.inf)
+
+    def visit_neighbours(self) -> None:
+        """Compare all points with the triangles of the nearest centroids, which are mostly the best."""
+        count, every = min(NEIGHBOURS, len(self.on.faces)), np.arange(len(self.points))
+        away, triangles = self.on.tree.query(self.points, k=np.arange(1, count + 1))
+        # The first alone: its distance mostly rules out all but a few of the others.
+        self._compare(every, triangles[:, 0])
+        row, column = np.nonzero(away[:, 1:] < self.cost[:, None] + self.on.radii[triangles[:, 1:]])
+        self._compare(row, triangles[row, column + 1])
+
+    def visit(self, group: Group) -> None:
+        """Compare all points with the triangles of a group that may be nearer than the best so far."""
+        start, size = 0, 64
+        while start < len(self.points):
+            rows = np.arange(start, min(start + size, len(self.points)))
+            found = group.tree.query_ball_point(self.points[rows], self.cost[rows] + group.radius)
+            near = np.fromiter(itertools.chain.from_iterable(found), np.int64)
+            self._compare(np.repeat(rows, [len(one) for one in found]), group.triangles[near])
+            start, size = start + size, min(4 * size, 1 + PAIRS * size // (1 + len(near)))
+
+    def _compare(self, row: np.ndarray, triangle: np.ndarray) -> None:
+        """Compare points of `row` (Q,) with triangles (Q,), and keep the best of each point."""
+        on = self.on
+        points, plane = self.points[row], on.planes[triangle]
+        turned = 0.0
+        if self.normals is not None:
+            turned = self.turn * (1 - np.einsum("qx,qx->q", plane, self.normals[row]))
+        away = points - on.centroids[triangle]
+        height = np.einsum("qx,qx->q", away, plane)
+        aside = np.sqrt(np.maximum(np.einsum("qx,qx->q", away, away) - height**2, 0)) - on.radii[triangle]
+        near = np.hypot(height, np.maximum(aside, 0)) + turned < self.cost[row]
+        row, triangle, points = row[near], triangle[near], points[near]
+        corners = on.vertices[on.faces[triangle]]
+        weights = barycentric(points, corners)
+        distance = np.linalg.norm(np.einsum("qc,qcx->qx", weights, corners) - points, axis=1)
+        cost = distance + (turned if self.normals is None else np.asarray(turned)[near])
+        order = np.lexsort((cost, row))
+        best = order[np.diff(row[order], prepend=-1) > 0]
+        best = best[cost[best] < self.cost[row[best]]]
+        row = row[best]
+        self.face[row], self.weights[row] = triangle[best], weights[best]
+        self.distance[row], self.cost[row] = distance[best], cost[best]
+
+
+def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the barycentric weights (P, 3) of the point of each triangle (P, 3, 3) closest to each point (P, 3).
+
+    The foot of the perpendicular where it falls inside; otherwise the best of the closest points of the three edges.
+    Weights lie in [0, 1] and sum to 1, also for triangles without area.
     """
-    corners = np.asarray(vertices, np.float64)[faces]
-    doubled = np.repeat(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 3, axis=0)
-    total = np.stack([np.bincount(np.ravel(faces), axis, len(vertices)) for axis in doubled.T], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    candidates = np.empty((4, len(points), 3))
+    for edge, (start, end) in enumerate(((a, b), (b, c), (c, a))):
+        along = end - start
+        t = np.sum((points - start) * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-300)
+        t = np.clip(t, 0, 1)
+        candidates[edge] = np.roll(np.stack([1 - t, t, np.zeros_like(t)], axis=1), edge, axis=1)
+    normal = np.cross(b - a, c - a)
+    square = np.maximum(np.sum(normal**2, axis=1), 1e-300)
+    inside_b = np.sum(np.cross(points - a, c - a) * normal, axis=1) / square
+    inside_c = np.sum(np.cross(b - a, points - a) * normal, axis=1) / square
+    candidates[3] = np.stack([1 - inside_b - inside_c, inside_b, inside_c], axis=1)
+    distance = np.linalg.norm(np.einsum("kpc,pcx->kpx", candidates, triangles) - points, axis=2)
+    outside = (candidates[3] < 0).any(axis=1) | (np.sum(normal**2, axis=1) == 0)
+    distance[3, outside] = np.inf
+    return np.take_along_axis(candidates, np.argmin(distance, axis=0)[None, :, None], axis=0)[0]
 
 
 def at(on: Surface, hits: Hits, values: np.ndarray) -> np.ndarray:
-    """Values (V, ...) of the surface's vertices at the points that were found, (P, ...)."""
+    """Return the values (P, ...) at the closest points, interpolated from those (V, ...) of the surface's vertices."""
     return np.einsum("pk,pk...->p...", hits.weights, values[on.faces[hits.face]])
 
 
 def on_edge(on: Surface, hits: Hits) -> np.ndarray:
-    """Which of the points found lie on the surface's boundary, (P,): what is nearest to a hole's far side."""
+    """Return which closest points lie on the surface's boundary, (P,) bool."""
     return at(on, hits, on.edge.astype(np.float64)) > 0.99

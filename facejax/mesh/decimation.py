@@ -10,7 +10,7 @@ from __future__ import annotations
 import fast_simplification
 import numpy as np
 
-from facejax.mesh import graph
+from facejax.mesh import closest_point, graph
 
 
 def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> t
         to_centre = np.linalg.norm(points[:, None] - centre, axis=2)
         reach = np.min(to_centre + radius, axis=1, keepdims=True)
         row, triangle = np.nonzero(to_centre - radius <= reach * (1 + 1e-9))
-        found = closest_point(points[row], triangles[triangle])
+        found = closest_point.barycentric(points[row], triangles[triangle])
         distance = np.linalg.norm(np.einsum("pc,pcx->px", found, triangles[triangle]) - points[row], axis=1)
         order = np.lexsort((distance, row))
         best = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
@@ -68,27 +68,3 @@ def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> t
     # Rounding leaves corners of 1e-16; without them a kept vertex maps to itself exactly.
     weights[weights < 1e-6] = 0
     return corners, weights / weights.sum(axis=1, keepdims=True)
-
-
-def closest_point(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Barycentric weights (P, 3) of the point of each triangle (P, 3, 3) closest to each point (P, 3).
-
-    The foot of the perpendicular where it falls inside; otherwise the best of the closest points of the
-    three edges.
-    """
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    candidates = np.empty((4, len(points), 3))
-    for edge, (start, end) in enumerate(((a, b), (b, c), (c, a))):
-        along = end - start
-        t = np.sum((points - start) * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-300)
-        t = np.clip(t, 0, 1)
-        candidates[edge] = np.roll(np.stack([1 - t, t, np.zeros_like(t)], axis=1), edge, axis=1)
-    normal = np.cross(b - a, c - a)
-    square = np.maximum(np.sum(normal**2, axis=1), 1e-300)
-    inside_b = np.sum(np.cross(points - a, c - a) * normal, axis=1) / square
-    inside_c = np.sum(np.cross(b - a, points - a) * normal, axis=1) / square
-    candidates[3] = np.stack([1 - inside_b - inside_c, inside_b, inside_c], axis=1)
-    distance = np.linalg.norm(np.einsum("kpc,pcx->kpx", candidates, triangles) - points, axis=2)
-    outside = (candidates[3] < 0).any(axis=1) | (np.sum(normal**2, axis=1) == 0)
-    distance[3, outside] = np.inf
-    return np.take_along_axis(candidates, np.argmin(distance, axis=0)[None, :, None], axis=0)[0]

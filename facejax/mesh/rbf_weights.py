@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from facejax.geometry import rbf
+from facejax.geometry.interpolation import smoothstep
 from facejax.mesh import decimation, graph
 
 # The upper and the lower lip among iBUG's 68 landmarks; the corners of the mouth belong to both.
@@ -80,8 +81,7 @@ def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, r
     if len(pinned) == 0:
         return np.ones(len(vertices), np.float32)
     distance = cKDTree(landmarks).query(vertices)[0]
-    t = np.minimum(distance / distance[pinned].min(), 1)
-    return (1 - t * t * (3 - 2 * t)).astype(np.float32)
+    return (1 - smoothstep(distance, 0, distance[pinned].min())).astype(np.float32)
 
 
 def upper_lip_share(
@@ -99,8 +99,7 @@ def upper_lip_share(
     reached = np.isfinite(upper) & np.isfinite(lower)
     total = np.where(reached, upper + lower, 2)
     share = np.where(reached, lower, 1) / np.maximum(total, np.finfo(np.float64).tiny)
-    t = np.clip(2 * share - 0.5, 0, 1)
-    return (t * t * (3 - 2 * t)).astype(np.float32)
+    return smoothstep(share, 0.25, 0.75).astype(np.float32)
 
 
 def split_lips(

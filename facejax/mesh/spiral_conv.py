@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from facejax.mesh import normals
 from facejax.mesh.stencils import Stencil
 
 # With few output channels the products over all positions come out of one matrix product, and the batch
@@ -89,23 +88,6 @@ def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> ja
     products = products.transpose(0, 2, 1, 3).reshape(count * positions, batch * out_channels)
     summed = _stencil_p.bind(products, *_joined(stencil), axis=0, transposed=False)
     return summed.reshape(stencil.source.shape[2], batch, out_channels)
-
-
-@jax.jit
-def vertex_normals(vertices: jax.Array, faces: jax.Array) -> jax.Array:
-    """Unit normals (..., N, 3) of vertices (..., N, 3): the mean of the adjacent triangles' (F, 3), by area.
-
-    Zero where the adjacent triangles have no area, or cancel.
-    """
-    a, b, c = (vertices[..., faces[:, corner], :] for corner in range(3))
-    normal, double = normals.normals(b - a, c - a)
-    parts = jnp.concatenate([double * normal, double], axis=-1)
-    total = jnp.zeros((*vertices.shape[:-1], 4), vertices.dtype)
-    for corner in range(3):
-        total = total.at[..., faces[:, corner], :].add(parts)
-    mean, area = total[..., :3], total[..., 3:]
-    # What rounding leaves of areas that cancel is no direction.
-    return normals.direction(mean, normals.length(mean), jnp.finfo(mean.dtype).eps * area)
 
 
 def _joined(stencil: Stencil) -> Stencil:

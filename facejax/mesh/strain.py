@@ -47,7 +47,7 @@ def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles
     a, b, c = (neutral[tables.faces[:, corner]] for corner in range(3))
     moved = [displacements[tables.faces[:, corner]] for corner in range(3)]
     first, second = b - a, c - a
-    normal, double = normals.normals(first, second)
+    normal, double = normals.triangle_normals(first, second)
     # The dual basis of the two edges: G = du1 (x) dual1 + du2 (x) dual2.
     over = jnp.where(double > 0, 1 / jnp.where(double > 0, double, 1), 0)
     duals = jnp.cross(second, normal) * over, jnp.cross(normal, first) * over
@@ -63,4 +63,4 @@ def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles
     mean = padded[tables.about].sum(axis=1) / tables.count[:, None, None]
     # What is left of a fold's normals that cancel is no direction.
     lean = mean[..., 6:]
-    return mean[..., :6], normals.direction(lean, normals.length(lean), jnp.finfo(lean.dtype).eps)
+    return mean[..., :6], normals.unit_or_zero(lean, normals.norm(lean), jnp.finfo(lean.dtype).eps)

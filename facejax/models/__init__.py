@@ -1,1 +1,1 @@
-"""Models as `init` and `apply` pairs on plain pytrees."""
+"""Models: pure `init` and `apply` functions on plain pytrees of parameters."""

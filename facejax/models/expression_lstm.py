@@ -22,7 +22,7 @@ import numpy as np
 from facejax.models import lstm
 
 STARTS = ("zero", "neutral")
-HOME, QUIET = 0.3, 5  # an expression is over when it has come back so far, and been quiet for so many frames
+RETURN_FRACTION, QUIET_STEPS = 0.3, 5  # an expression is over when it has come back so far, and been quiet for so many frames
 
 
 class Config(NamedTuple):
@@ -161,12 +161,12 @@ def expression_length(curve: jax.Array, *, fraction: float = 0.01) -> jax.Array:
     """
     energy = jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1))
     away = jnp.sqrt(jnp.sum((curve - curve[..., :1, :, :]) ** 2, axis=(-2, -1)))
-    home = away <= HOME * jax.lax.cummax(away, axis=away.ndim - 1)
+    home = away <= RETURN_FRACTION * jax.lax.cummax(away, axis=away.ndim - 1)
     top = jax.lax.cummax(energy, axis=energy.ndim - 1)
     loud = (energy > fraction * top) | (top == 0)
     # Loud frames within the next QUIET steps; past the end of the curve nothing is known, so nothing ends there.
-    ahead = jnp.concatenate([loud, jnp.ones((*loud.shape[:-1], QUIET), bool)], axis=-1)
-    busy = sum(ahead[..., i : i + loud.shape[-1]].astype(jnp.int32) for i in range(QUIET))
+    ahead = jnp.concatenate([loud, jnp.ones((*loud.shape[:-1], QUIET_STEPS), bool)], axis=-1)
+    busy = sum(ahead[..., i : i + loud.shape[-1]].astype(jnp.int32) for i in range(QUIET_STEPS))
     over = home[..., :-1] & (busy == 0)
     return jnp.where(jnp.any(over, axis=-1), jnp.argmax(over, axis=-1) + 1, curve.shape[-3])
 

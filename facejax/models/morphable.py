@@ -1,7 +1,7 @@
 """A 3D morphable model: faces as a mean and principal components (Blanz & Vetter 1999; Seo & Luo 2021, 2.1).
 
 Any values that examples have at their vertices will do: shape, colours, normals, each with a model of its own.
-`direction` finds what to add to a face for more of an attribute, and `fit_two` keeps identity and expression apart.
+`direction` finds what to add to a face for more of an attribute, and `fit_identity_expression` keeps identity and expression apart.
 
     shape = morphable.fit(heads, components=40)
     nearest = morphable.apply(shape, morphable.project(shape, head))
@@ -104,7 +104,7 @@ def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -
     return jnp.asarray(total / np.sum(centred**2) if unit else total, jnp.float32)
 
 
-def fit_two(
+def fit_identity_expression(
     neutral: np.ndarray, displacements: np.ndarray, *, identity: int, expression: int
 ) -> IdentityExpressionModel:
     """Identity and expression apart, with so many components each.
@@ -127,7 +127,7 @@ def fit_two(
 
 
 @jax.jit
-def face(two: IdentityExpressionModel, identity: jax.Array, expression: jax.Array) -> jax.Array:
+def face(model: IdentityExpressionModel, identity: jax.Array, expression: jax.Array) -> jax.Array:
     """Vertices (..., N, 3) in mm, of identity coefficients (..., k) and expression coefficients (..., l).
 
     Their leading axes broadcast: one identity does for all frames. Zero expression coefficients are the mean
@@ -138,7 +138,7 @@ def face(two: IdentityExpressionModel, identity: jax.Array, expression: jax.Arra
     except ValueError:
         shapes = f"{jnp.shape(identity)} and {jnp.shape(expression)}"
         raise ValueError(f"identity and expression: expected leading axes that broadcast, got {shapes}") from None
-    return _apply(two.identity, "identity", identity) + _apply(two.expression, "expression", expression)
+    return _apply(model.identity, "identity", identity) + _apply(model.expression, "expression", expression)
 
 
 def variance_kept(params: MorphableModel) -> np.ndarray:

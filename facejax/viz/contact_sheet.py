@@ -1,4 +1,4 @@
-"""Pictures with words: labelled grids and captions under a film."""
+"""Labelled grids of pictures, and captions below the frames of a video."""
 
 import os
 
@@ -9,12 +9,15 @@ from facejax.io import atomic
 
 
 def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.ndarray:
-    """Pictures in a labelled grid, (height, width, 3) uint8.
+    """Arrange pictures in a labelled grid, (height, width, 3) uint8.
 
     Args:
       rows: rows of pictures, each (h, w, 3) uint8, all of one size; a row may be short.
       row_labels, column_labels: texts, as many as rows and columns.
       gap: pixels between pictures.
+
+    Raises:
+      ValueError: no picture, a picture of another size, or a wrong number of labels.
     """
     rows = [list(row) for row in rows]
     columns = max((len(row) for row in rows), default=0)
@@ -55,11 +58,11 @@ def save(path: str | os.PathLike, pixels) -> None:
 
 
 def caption(pictures, captions) -> np.ndarray:
-    """Adds a strip below the frames with the text of the moment.
+    """Add a strip with the current caption below each frame.
 
     Args:
       pictures: (T, H, W, 3) uint8.
-      captions: ((first frame, text), ...) by rising frame; each holds until the next.
+      captions: ((first frame, text), ...) by rising frame; each is shown until the next.
 
     Returns:
       (T, H + strip, W, 3) uint8, of even height.
@@ -80,12 +83,12 @@ def caption(pictures, captions) -> np.ndarray:
 
 
 def _font(text: str, size: int, width: float):
-    """Pillow's own font at the given size, or smaller if the text is wider than the width."""
+    """Return Pillow's built-in font at the given size, or smaller if the text is wider than `width`."""
     while (font := ImageFont.load_default(size=size)).getlength(text) > width and size > 6:
         size -= 1
     return font
 
 
 def _printable(text: str) -> str:
-    """Pillow's built-in font has no arrow."""
+    """Replace the arrow, which Pillow's built-in font does not have."""
     return text.replace("→", "to")

@@ -1,24 +1,24 @@
-"""Which triangle does each sample of a picture see: a z-buffer in plain numpy.
+"""Rasterise triangles with a z-buffer in NumPy: find the nearest triangle of every sample.
 
-Every triangle is cut into rows and every row into one span of samples: the work grows with the samples
-covered, not with bounding boxes, and no Python loop runs over triangles. Barycentric coordinates and
-1/depth are affine on the screen, so that a row needs one value and one slope.
+Every triangle is cut into rows and every row into one span of samples: the work grows with the samples covered, not with
+bounding boxes, and no Python loop runs over triangles. Barycentric coordinates and 1/depth are affine on the screen, so
+that a row needs one value and one slope. N vertices, F triangles, S samples.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-# A key is depth above, triangle below, in one int64: the nearest triangle is the greatest key.
+# A key holds 1/depth in its high bits and the triangle in its low bits: the nearest triangle has the greatest key.
 _BITS = 24
 _LOW = (1 << _BITS) - 1
 
 
 class Hits(NamedTuple):
-    """The samples that see a triangle.
+    """The samples that are covered by a triangle.
 
     sample: (S,) index row * width + column, rising.
-    face: (S,) triangle seen.
+    face: (S,) visible triangle.
     inside: (3, S) screen barycentric coordinates, float32.
     """
 
@@ -28,13 +28,16 @@ class Hits(NamedTuple):
 
 
 def rasterize(points: np.ndarray, nearness: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Hits:
-    """Finds the nearest triangle of every sample, front and back faces alike.
+    """Find the nearest triangle of every sample, front and back faces alike.
 
     Args:
       points: (N, 2) columns and rows; the sample (row i, column j) lies at (j, i).
-      nearness: (N,) 1/depth; triangles with a corner at nearness <= 0 are left out.
+      nearness: (N,) 1/depth; triangles with a corner at nearness <= 0 are skipped.
       faces: (F, 3), at most 2**24.
       size: (width, height).
+
+    Raises:
+      ValueError: too many triangles.
     """
     width, height = size
     if len(faces) > _LOW:
@@ -82,7 +85,7 @@ def rasterize(points: np.ndarray, nearness: np.ndarray, faces: np.ndarray, size:
 
 
 def _barycentric(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates as a x + b y + c: (3 of a b c, 3 corners, F), and (F,) whether the triangle has area."""
+    """Return coordinates as a x + b y + c: (3 of a b c, 3 corners, F), and (F,) whether the triangle has area."""
     xj, xk, yj, yk = x[[1, 2, 0]], x[[2, 0, 1]], y[[1, 2, 0]], y[[2, 0, 1]]
     area = (x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])
     good = np.abs(area) > 1e-9
@@ -91,7 +94,7 @@ def _barycentric(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _span(plane: np.ndarray, face: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns from and to which all three coordinates of a face are >= 0 on a row."""
+    """Return the first and last columns at which all three coordinates of a face are >= 0 on a row."""
     left, right = np.full(len(face), -np.inf), np.full(len(face), np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for a, b, c in plane.transpose(1, 0, 2):
@@ -104,6 +107,6 @@ def _span(plane: np.ndarray, face: np.ndarray, row: np.ndarray) -> tuple[np.ndar
 
 
 def _count_up(counts: np.ndarray) -> np.ndarray:
-    """0..counts[0]-1, 0..counts[1]-1, ... in one array."""
+    """Return 0..counts[0]-1, 0..counts[1]-1, ... in one array."""
     ends = np.cumsum(counts)
     return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)

@@ -1,21 +1,32 @@
-"""Still pictures of a face on any machine: no GL, no display, numpy only.
+"""Render pictures of a face in NumPy, without OpenGL or a display.
 
-Smooth shading (interpolated normals), one perspective camera for a whole motion, several samples per pixel.
-Back faces (the inside of a head, seen through its mouth) are dark. A head of 6,388 triangles takes about 45
-ms at 256 x 320 pixels on one core.
+Smooth shading (interpolated normals), one perspective camera for a whole motion, several samples per pixel. Back faces
+(the inside of a head, visible through its mouth) are dark. A head of 6,388 triangles takes about 45 ms at 256 x 320
+pixels on one core. T frames, N vertices, F faces, L landmarks; millimetres.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from facejax.viz import props, rasterizer, scene, shading
+from facejax.mesh import graph
+from facejax.viz import rasterizer, scene, shading
 from facejax.viz.contact_sheet import caption, contact_sheet, save
 
-__all__ = ["Camera", "caption", "contact_sheet", "fit_camera", "frames", "heat_colours", "image", "save"]
+__all__ = [
+    "Camera",
+    "caption",
+    "close_largest_hole",
+    "contact_sheet",
+    "fit_camera",
+    "frames",
+    "heat_colours",
+    "image",
+    "save",
+]
 
 SKIN_GLOSS = 0.30
-LANDMARK = (0.02, 0.55, 0.80)
+LANDMARK_COLOUR = (0.02, 0.55, 0.80)
 
 
 class Camera(NamedTuple):
@@ -32,15 +43,15 @@ class Camera(NamedTuple):
 
 
 def fit_camera(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, margin=0.05) -> Camera:
-    """A camera that holds every given vertex, in all frames, in the picture.
+    """Return a camera that has every given vertex, in all frames, in the picture.
 
     Args:
-      vertices: (..., 3) all that must be seen; mm.
+      vertices: (..., 3) that must be visible; mm.
       size: (width, height).
       turn: degrees to the subject's left (the viewer's right).
       tilt: degrees from above.
       field: vertical angle of view in degrees.
-      margin: free part of the picture at each edge.
+      margin: fraction of the picture that stays free at each edge.
     """
     points = np.asarray(vertices, np.float64).reshape(-1, 3)
     turn, tilt = np.radians(turn), np.radians(tilt)
@@ -51,7 +62,7 @@ def fit_camera(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, mar
     view = points @ axes.T
     low, high = view.min(0), view.max(0)
     middle = (low + high) / 2
-    # |x| zoom / (distance - z) <= reach for every point: the farthest demand decides.
+    # |x| zoom / (distance - z) <= reach for every point; the largest required distance applies.
     reach = np.array([size[0] / size[1], 1.0]) * (1 - 2 * margin)
     distance = (np.abs(view[:, :2] - middle[:2]) * zoom / reach + view[:, 2:]).max()
     return Camera(axes, axes.T @ np.array([middle[0], middle[1], distance]), float(zoom))
@@ -69,51 +80,54 @@ def frames(
     background=(0.93, 0.94, 0.96),
     samples=2,
 ) -> np.ndarray:
-    """Draws every frame from one fixed camera.
+    """Render every frame from one fixed camera.
 
     Args:
       vertices: (T, N, 3) mm.
       faces: (F, 3).
       size: (width, height) in pixels.
-      camera: a `Camera`; without one the whole motion is framed from the front.
-      colours: (N, 3) or (T, N, 3) sRGB in [0, 1], for heat maps; skin without.
+      camera: a `Camera`; default: one that fits the whole motion, from the front.
+      colours: (N, 3) or (T, N, 3) sRGB in [0, 1], for heat maps; default: skin.
       landmarks: (T, L, 3) positions or (L,) vertex indices, drawn as dots where visible.
-      extras: parts beside the face, see `scene.Part`.
+      extras: further meshes, see `scene.Part`.
       background: sRGB.
       samples: samples per pixel along each axis.
 
     Returns:
       (T, height, width, 3) uint8.
+
+    Raises:
+      ValueError: invalid arrays, see `scene.make`, or colours of a wrong shape.
     """
-    film = scene.make(vertices, faces, landmarks=landmarks, extras=extras)
-    view = fit_camera(film.vertices, size=size) if camera is None else camera
-    count, points = film.vertices.shape[:2]
+    animation = scene.make(vertices, faces, landmarks=landmarks, extras=extras)
+    view = fit_camera(animation.vertices, size=size) if camera is None else camera
+    count, points = animation.vertices.shape[:2]
     tint = np.asarray(scene.SKIN if colours is None else colours, np.float32)
     if tint.shape not in ((3,), (points, 3), (count, points, 3)):
         raise ValueError(f"colours must be ({points}, 3) or ({count}, {points}, 3), got {tint.shape}")
     tint = np.broadcast_to(shading.linear(tint), (count, points, 3))
-    neighbours = shading.neighbours(film.faces, points)
-    # The stopper is drawn but gives no normal: the rim of the neck keeps its own light.
-    solid = np.concatenate([film.faces, props.close_largest_hole(film.vertices[0], film.faces)])
+    neighbours = shading.neighbours(animation.faces, points)
+    # The closing triangles are drawn but do not change normals: the shading of the neck's rim stays as it is.
+    solid = np.concatenate([animation.faces, close_largest_hole(animation.vertices[0], animation.faces)])
     backdrop = _backdrop(background, size, samples)
     pictures = np.empty((count, size[1], size[0], 3), np.uint8)
-    for t, surface in enumerate(film.vertices):
-        normals = scene.normals(surface, film.faces)
+    for t, surface in enumerate(animation.vertices):
+        normals = scene.normals(surface, animation.faces)
         cavity = shading.cavity(surface, normals, neighbours)
         layers = [_Layer(surface, normals, tint[t] * cavity[:, None], solid, SKIN_GLOSS)]
-        layers += [_layer(part, t) for part in film.extras]
-        dots = None if film.landmarks is None else film.landmarks[t]
+        layers += [_layer(part, t) for part in animation.extras]
+        dots = None if animation.landmarks is None else animation.landmarks[t]
         pictures[t] = _draw(layers, dots, view, backdrop.copy(), samples)
     return pictures
 
 
 def image(vertices, faces, *, landmarks=None, **options) -> np.ndarray:
-    """One picture, (height, width, 3) uint8, of vertices (N, 3); options as of `frames`."""
+    """Render one picture (height, width, 3) uint8 of vertices (N, 3); options as of `frames`."""
     return frames(np.asarray(vertices)[None], faces, landmarks=landmarks, **options)[0]
 
 
 def heat_colours(values, *, low=0.0, high=None) -> np.ndarray:
-    """Colours (..., 3) of values (...): pale, yellow, orange, dark red; high is the maximum if not given."""
+    """Map values (...) to colours (..., 3): pale, yellow, orange, dark red; `high` defaults to the maximum."""
     values = np.asarray(values, np.float64)
     high = float(values.max()) if high is None else high
     at = np.clip((values - low) / max(high - low, 1e-12), 0, 1)
@@ -122,6 +136,19 @@ def heat_colours(values, *, low=0.0, high=None) -> np.ndarray:
     )
     grid = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(at, grid, stops[:, c]) for c in range(3)], -1)
+
+
+def close_largest_hole(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return triangles (K, 3) that close the largest of several holes, so that no light shows through a mouth.
+
+    The largest hole of a head is its neck. A mesh (N, 3), (F, 3) with fewer than two holes, such as a mask, stays open:
+    no triangles. No vertex is added.
+    """
+    loops = [loop[::-1].tolist() for loop in graph.boundary_loops(faces)]
+    if len(loops) < 2:
+        return np.zeros((0, 3), np.int32)
+    length = [np.linalg.norm(np.diff(vertices[loop + loop[:1]], axis=0), axis=1).sum() for loop in loops]
+    return _strip(loops[int(np.argmax(length))])
 
 
 class _Layer(NamedTuple):
@@ -141,7 +168,7 @@ def _layer(part: scene.Part, t: int) -> _Layer:
 
 
 def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples: int) -> np.ndarray:
-    """Draws layers over a linear backdrop (height, width, 3) counted in samples; gives sRGB pixels."""
+    """Draw layers over a linear backdrop (height, width, 3) counted in samples; return sRGB pixels."""
     height, width = picture.shape[:2]
     offsets = np.cumsum([0] + [len(layer.vertices) for layer in layers])
     points = np.concatenate([layer.vertices for layer in layers])
@@ -176,7 +203,7 @@ def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples
 
 
 def _project(points: np.ndarray, view: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows in samples, (N, 2), and 1/depth, (N,), not positive behind the camera."""
+    """Return columns and rows in samples (N, 2), and 1/depth (N,), not positive behind the camera."""
     x, y, z = ((points - view.eye) @ view.turn.T).T
     nearness = np.where(z < -1e-3, -1 / np.minimum(z, -1e-3), 0)
     scale = view.zoom * height / 2 * nearness
@@ -184,7 +211,7 @@ def _project(points: np.ndarray, view: Camera, width: int, height: int) -> tuple
 
 
 def _stamp(picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, view: Camera) -> None:
-    """Draws a disc at every landmark that is not more than 3 mm behind the surface seen there."""
+    """Draw a disc at every landmark that is not more than 3 mm behind the visible surface."""
     height, width = depth.shape
     radius = max(2.0, height / 150)
     screen, nearness = _project(dots, view, width, height)
@@ -197,11 +224,23 @@ def _stamp(picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, view: Camer
         rows, columns = np.ogrid[y0 - reach : y0 + reach + 1, x0 - reach : x0 + reach + 1]
         cover = np.clip(radius + 0.5 - np.hypot(columns - x, rows - y), 0, 1)[..., None]
         patch = picture[y0 - reach : y0 + reach + 1, x0 - reach : x0 + reach + 1]
-        patch += cover * (np.array(LANDMARK, np.float32) - patch)
+        patch += cover * (np.array(LANDMARK_COLOUR, np.float32) - patch)
 
 
 def _backdrop(colour, size, samples: int) -> np.ndarray:
-    """A soft vertical fall-off, (height, width, 3) linear float32, counted in samples."""
+    """Return a vertical gradient (height, width, 3) linear float32, counted in samples."""
     height = size[1] * samples
     fall = np.linspace(1.03, 0.86, height, dtype=np.float32)[:, None, None]
     return np.broadcast_to(shading.linear(np.asarray(colour, np.float32)) * fall, (height, size[0] * samples, 3))
+
+
+def _strip(loop: list[int]) -> np.ndarray:
+    """Triangulate a closed loop as a strip, adding no vertex."""
+    low, high, triangles = 0, len(loop) - 1, []
+    while high - low > 1:
+        triangles.append((loop[low], loop[low + 1], loop[high]))
+        low += 1
+        if high - low > 1:
+            triangles.append((loop[low], loop[high - 1], loop[high]))
+            high -= 1
+    return np.array(triangles, np.int32).reshape(-1, 3)

@@ -1,18 +1,20 @@
-"""What every exporter takes: one moving face, and what stands still around it.
+"""Scene records that every exporter takes: one animated face and further meshes.
 
-Vocabulary: T frames, N vertices, F faces, L landmarks, M vertices of an extra part. Millimetres, y up, z
-out of the face. A colour is sRGB in [0, 1], one `(3,)` for a part or `(M, 3)` for its vertices.
+T frames, N vertices, F faces, L landmarks, M vertices and K faces of a part. Millimetres, y up, z out of the face.
+A colour is sRGB in [0, 1], one `(3,)` for a part or `(M, 3)` for its vertices.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from facejax.mesh.normals import vertex_normals_host
+
 SKIN = (0.86, 0.70, 0.62)
 
 
 class Part(NamedTuple):
-    """A mesh beside the face: eyeballs, teeth.
+    """A mesh besides the face, such as eyeballs or teeth.
 
     vertices: (M, 3), or (T, M, 3) where it moves.
     faces: (K, 3) int.
@@ -32,7 +34,7 @@ class Scene(NamedTuple):
     vertices: (T, N, 3) float32.
     faces: (F, 3) int32.
     fps: frames per second.
-    captions: ((first frame, text), ...), by rising frame; each holds until the next.
+    captions: ((first frame, text), ...), by rising frame; each is shown until the next.
     landmarks: (T, L, 3) float32, or None.
     extras: parts.
     """
@@ -46,7 +48,7 @@ class Scene(NamedTuple):
 
 
 def make(vertices, faces, *, fps=30.0, captions=(), landmarks=None, extras=()) -> Scene:
-    """Checks and completes a scene.
+    """Return a validated scene with all fields.
 
     Args:
       vertices: (T, N, 3), or (N, 3) for one frame; mm.
@@ -55,7 +57,7 @@ def make(vertices, faces, *, fps=30.0, captions=(), landmarks=None, extras=()) -
       extras: `Part` records, or tuples (vertices, faces, colour[, gloss]).
 
     Raises:
-      ValueError: a shape, an index or a number is out of order; says which.
+      ValueError: a wrong shape, index, caption or number; names it.
     """
     vertices = np.asarray(vertices, np.float32)
     vertices = vertices[None] if vertices.ndim == 2 else vertices
@@ -77,27 +79,13 @@ def make(vertices, faces, *, fps=30.0, captions=(), landmarks=None, extras=()) -
 
 
 def normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit vertex normals, area weighted, (..., N, 3) of (..., N, 3); (0, 0, 1) at a vertex without area."""
-    points = vertices.shape[-2]
-    owner = faces.T.ravel()
-    total = np.empty(vertices.shape, vertices.dtype)
-    for frame in np.ndindex(vertices.shape[:-2]):
-        a, b, c = np.take(vertices[frame], faces.T, axis=0)
-        face = _cross(b - a, c - a)
-        for axis in range(3):
-            total[(*frame, slice(None), axis)] = np.bincount(owner, np.tile(face[axis], 3), points)
-    length = np.sqrt(np.einsum("...a,...a->...", total, total))[..., None]
-    return np.where(length > 1e-20, total / np.maximum(length, 1e-20), np.array([0, 0, 1], total.dtype))
-
-
-def _cross(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The coordinates of u x v in double; `np.cross` works on the short axis and takes ten times as long."""
-    (a, b, c), (x, y, z) = u.T.astype(np.float64), v.T.astype(np.float64)
-    return b * z - c * y, c * x - a * z, a * y - b * x
+    """Return unit vertex normals, area weighted, (..., N, 3) of (..., N, 3); (0, 0, 1) at a vertex without area."""
+    found = vertex_normals_host(vertices, faces)
+    return np.where(found.any(axis=-1, keepdims=True), found, np.array([0, 0, 1], found.dtype))
 
 
 def colours(part: Part) -> np.ndarray:
-    """The colour of each vertex of a part, (M, 3) float32 in [0, 1]."""
+    """Return the colour of each vertex of a part, (M, 3) float32 in [0, 1]."""
     return np.broadcast_to(np.asarray(part.colour, np.float32), (part.vertices.shape[-2], 3))
 
 

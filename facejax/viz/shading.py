@@ -1,8 +1,8 @@
-"""How light falls on a face.
+"""Shading of a face: lights, sRGB, and cavity darkening.
 
-The lights and the viewer are far away, so light is a function of the camera-space normal alone: it is
-tabulated once and looked up for every sample. Hollows are darkened by the mesh's own curvature, which makes
-wrinkles readable.
+Lights and viewer are far away, so light is a function of the camera-space normal alone: it is tabulated once and light_at
+up for every sample. Concave regions are darkened by the mesh's curvature, which makes wrinkles visible.
+N vertices, S samples.
 """
 
 import functools
@@ -10,7 +10,7 @@ import functools
 import numpy as np
 
 # Studio lights in camera space: direction (x right, y up, z to the viewer) and linear colour.
-# Sky and ground fill the rest.
+# Ambient light comes from sky and ground.
 LIGHTS = (
     ((-0.50, 0.55, 0.67), (0.92, 0.85, 0.76)),
     ((0.85, 0.10, 0.52), (0.20, 0.25, 0.32)),
@@ -22,19 +22,19 @@ _TABLE = 512
 
 
 def shade(normal: np.ndarray, colour: np.ndarray, gloss: np.ndarray) -> np.ndarray:
-    """Linear light (S, 3) for camera-space normals (S, 3), linear colours (S, 3) and gloss (S,)."""
+    """Return linear light (S, 3) for camera-space normals (S, 3), linear colours (S, 3) and gloss (S,)."""
     length = np.sqrt(np.einsum("sa,sa->s", normal, normal))
     scale = (_TABLE / 2 - 1) / np.maximum(length, 1e-20)
     index = (normal[:, :2] * scale[:, None] + _TABLE / 2).astype(np.int32)
-    looked = np.take(_table(), index[:, 1] * _TABLE + index[:, 0], axis=0)
-    light = looked[:, :3] * colour
-    light += (looked[:, 3] * gloss)[:, None]
+    light_at = np.take(_table(), index[:, 1] * _TABLE + index[:, 0], axis=0)
+    light = light_at[:, :3] * colour
+    light += (light_at[:, 3] * gloss)[:, None]
     return light
 
 
 @functools.cache
 def _table() -> np.ndarray:
-    """(512 * 512, 4): diffuse r, g, b and highlight for the normal (x, y, sqrt(1 - x^2 - y^2)) on a grid."""
+    """Return diffuse r, g, b and highlight (512 * 512, 4) for the normal (x, y, sqrt(1 - x^2 - y^2)) on a grid."""
     axis = (np.arange(_TABLE) + 0.5 - _TABLE / 2) / (_TABLE / 2 - 1)
     x, y = np.meshgrid(axis, axis)
     z = np.sqrt(np.maximum(1 - x * x - y * y, 0))
@@ -44,7 +44,7 @@ def _table() -> np.ndarray:
     highlight = np.zeros(x.shape)
     for direction, colour in LIGHTS:
         direction = np.array(direction) / np.linalg.norm(direction)
-        # Light wraps a little around the edge, as it does under skin.
+        # Wrapped diffuse light, an approximation of subsurface scattering.
         facing = np.maximum((normal @ direction + 0.20) / 1.20, 0)
         diffuse = diffuse + facing[..., None] ** 1.2 * np.array(colour)
         half = direction + np.array([0, 0, 1])
@@ -54,7 +54,7 @@ def _table() -> np.ndarray:
 
 
 def neighbours(faces: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directed edges (from, to), unique, and the number of neighbours of each vertex."""
+    """Return unique directed edges (from, to), and the number of neighbours of each vertex."""
     edge = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     both = np.concatenate([edge, edge[:, ::-1]]).astype(np.int64)
     start, end = np.divmod(np.unique(both[:, 0] * points + both[:, 1]), points)
@@ -62,7 +62,7 @@ def neighbours(faces: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray, 
 
 
 def cavity(vertices: np.ndarray, normals: np.ndarray, neighbours) -> np.ndarray:
-    """(N,) brightness, under 1 in hollows and over 1 on ridges: mean curvature times edge length, bounded."""
+    """Return brightness (N,), below 1 in concave and above 1 in convex regions: bounded curvature times edge length."""
     start, end, count = neighbours
     step = vertices[end] - vertices[start]
     reach = np.bincount(start, np.linalg.norm(step, axis=1), len(vertices)) / count
@@ -72,7 +72,7 @@ def cavity(vertices: np.ndarray, normals: np.ndarray, neighbours) -> np.ndarray:
 
 
 def linear(colour: np.ndarray) -> np.ndarray:
-    """sRGB to linear light."""
+    """Convert sRGB to linear light."""
     return np.where(colour <= 0.04045, colour / 12.92, ((np.maximum(colour, 0) + 0.055) / 1.055) ** 2.4).astype(
         np.float32
     )
@@ -85,5 +85,5 @@ _SRGB = np.round(
 
 
 def encode(picture: np.ndarray) -> np.ndarray:
-    """Linear light to sRGB bytes by table: a power per pixel would cost more than drawing the face."""
+    """Convert linear light to sRGB bytes by a table: a power per pixel would cost more than rasterising the face."""
     return _SRGB[(np.clip(picture, 0, 1) * 4095 + 0.5).astype(np.int64)]

@@ -1,4 +1,4 @@
-"""Films: animated WebP and GIF by Pillow, MP4 by the ffmpeg that the extra `video` brings."""
+"""Write videos: animated WebP and GIF with Pillow, MP4 with the ffmpeg of the extra `video`."""
 
 import importlib.util
 import os
@@ -14,7 +14,7 @@ FORMATS = (".webp", ".gif", ".mp4")
 
 
 def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
-    """Writes pictures as a film, atomically. WebP and GIF loop and may merge equal neighbours; time is kept.
+    """Write pictures as a video, atomically. WebP and GIF loop and may merge equal frames; the timing is kept.
 
     Args:
       path: `.webp` (small, every browser), `.gif` (256 colours, times in hundredths of a second) or `.mp4`.
@@ -45,17 +45,17 @@ def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
 
 
 def check(path: str | os.PathLike) -> str:
-    """The film's suffix, if it can be written here; raises as `write` does, before any picture is drawn."""
+    """Return the suffix of a video that can be written on this machine; raise as `write` does otherwise."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
-        raise ValueError(f"{path}: unknown film format {suffix!r}; expected {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: unknown video format {suffix!r}; expected {', '.join(FORMATS)}")
     if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ImportError(f"{path}: MP4 needs imageio-ffmpeg: pip install 'facejax[video]'; .webp needs nothing")
     return suffix
 
 
 def _durations(count: int, fps: float, unit: int) -> list[int]:
-    """Milliseconds per frame in whole units, rounded so that no error adds up over the film."""
+    """Return milliseconds per frame in whole units, rounded without accumulating errors."""
     ends = np.round(np.arange(count + 1) * 1000 / fps / unit).astype(int) * unit
     return np.maximum(np.diff(ends), unit).tolist()
 
@@ -63,11 +63,11 @@ def _durations(count: int, fps: float, unit: int) -> list[int]:
 def _write_mp4(path: Path, frames: np.ndarray, fps: float, quality: int) -> None:
     import imageio_ffmpeg
 
-    # Most players want 4:2:0 colour, hence even sides: the last row or column is doubled where need be.
+    # Most players need 4:2:0 colour, hence even sides: the last row or column is repeated where necessary.
     even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")
     height, width = even.shape[1:3]
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:.6f}", "-i", "-"]
-    # 18 is taken for visually lossless, 51 is the worst.
+    # CRF 18 is visually lossless, 51 the worst.
     coding = ["-c:v", "libx264", "-crf", str(round(40 - quality / 4)), "-pix_fmt", "yuv420p"]
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *source, *coding, "-movflags", "+faststart", str(path)]
     done = subprocess.run(command, input=even.tobytes(), capture_output=True)

@@ -22,7 +22,7 @@ def plain(data, at):
 def test_meshes_of_splits_are_those_of_the_plain_loop_in_stored_order(ball_store, splits):
     found = of_split(ball_store, *splits, size=10)
     wanted = [at for at in range(len(ball_store.vertices)) if split_of(ball_store, at) in splits]
-    np.testing.assert_array_equal(found.at, wanted)
+    np.testing.assert_array_equal(found.indices, wanted)
     batches = list(found)
     assert [len(marks) for marks, _ in batches[:-1]] == [10] * (len(batches) - 1) and len(batches[-1][0]) <= 10
     marks, vertices = (np.concatenate(part) for part in zip(*batches, strict=True))
@@ -65,7 +65,7 @@ def test_rows_and_every_so_manieth(ball_store):
     for found, expected in zip(train.rows(at).read(np.array([2, 0])), train.read(np.array([11, 3])), strict=True):
         np.testing.assert_array_equal(found, expected)
     for step in (1, 3, 1000):
-        np.testing.assert_array_equal(train.thin(step).at, train.at[::step])
+        np.testing.assert_array_equal(train.thin(step).at, train.indices[::step])
         np.testing.assert_array_equal(train.thin(step).owner, train.owner[::step])
     assert train.rows(at).thin(2).count == 2 and train.size == train.thin(2).size
 
@@ -79,9 +79,9 @@ def test_folds_hold_out_each_mesh_once_and_nothing_alike_is_fitted(ball_store, b
     for fit_on, held_out in folds:
         of = [set((part.owner if by == "subjects" else part.labels).tolist()) for part in (fit_on, held_out)]
         assert of[1] and not of[0] & of[1]
-        np.testing.assert_array_equal(np.sort(np.concatenate([fit_on.at, held_out.at])), train.at)
+        np.testing.assert_array_equal(np.sort(np.concatenate([fit_on.indices, held_out.indices])), train.indices)
         assert fit_on.size == held_out.size == 9
-    np.testing.assert_array_equal(np.sort(np.concatenate([held_out.at for _, held_out in folds])), train.at)
+    np.testing.assert_array_equal(np.sort(np.concatenate([held_out.indices for _, held_out in folds])), train.indices)
 
 
 def test_folds_are_by_subjects_unless_said_and_one_each_of_few(ball_store):
@@ -89,7 +89,7 @@ def test_folds_are_by_subjects_unless_said_and_one_each_of_few(ball_store):
     found = [set(held_out.owner.tolist()) for _, held_out in train.folds(9)]
     assert found == [{0}, {2}, {4}, {5}]
     for (_, found), (_, expected) in zip(train.folds(2), train.folds(2, by="subjects"), strict=True):
-        np.testing.assert_array_equal(found.at, expected.at)
+        np.testing.assert_array_equal(found.indices, expected.indices)
 
 
 def test_wrong_folds_and_splits_are_named(ball_store):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from facejax.data.mesh_subset import of_split
-from facejax.evaluation import baselines, vertex_error
+from facejax.evaluation import baselines
 from facejax.mesh import hierarchy
 from facejax.models.decoders import dictionary, gpmm, linear, s2d_dec
 from facejax.training.recipes import fit_gpmm, fit_linear, fit_neural3dmm, fit_residual, fit_s2d_dec

@@ -43,9 +43,9 @@ def test_pairs_are_the_nearest_of_other_groups():
 def test_pairs_within_a_group_are_of_other_recordings():
     landmarks, _, group = sample(80, unseen=0.0)
     recording = np.arange(80) // 10
-    both, _ = noise_floor.nearest_pairs(landmarks, group, apart=recording, alike=True)
+    both, _ = noise_floor.nearest_pairs(landmarks, group, recording=recording, within_groups=True)
     assert (group[both[:, 0]] == group[both[:, 1]]).all() and (recording[both[:, 0]] != recording[both[:, 1]]).all()
     with pytest.raises(ValueError, match="need `apart`"):
-        noise_floor.nearest_pairs(landmarks, group, alike=True)
+        noise_floor.nearest_pairs(landmarks, group, within_groups=True)
     with pytest.raises(ValueError, match="no two frames to compare"):
         noise_floor.nearest_pairs(landmarks, np.zeros(80))

@@ -111,7 +111,7 @@ def test_distances_are_those_of_the_plain_loop(ball_store):
     for row, mask in zip(curves, regions.values(), strict=True):
         assert found.mean_std(mask) == pytest.approx((off[:, mask].mean(), off[:, mask].std()), rel=1e-5)
         # A distance that lies on an edge but for rounding may fall on either side of it.
-        expected = [np.mean(off[:, mask] < edge) for edge in vertex_error.EDGES]
+        expected = [np.mean(off[:, mask] < edge) for edge in vertex_error.BIN_EDGES]
         np.testing.assert_allclose(row, expected, atol=2 / off[:, mask].size)
 
 
@@ -119,7 +119,7 @@ def test_cumulative_curves_rise_to_one(ball_store):
     test, regions = of_split(ball_store, "test"), masks(ball_store)
     truth = test.person(test.subjects[0])[2]
     found = vertex_error.distances(lambda marks, neutral: neutral + 0.8 * truth, test, regions).cumulative()
-    assert found.shape == (2, len(vertex_error.EDGES)) and np.all(np.diff(found, axis=1) >= 0)
+    assert found.shape == (2, len(vertex_error.BIN_EDGES)) and np.all(np.diff(found, axis=1) >= 0)
     np.testing.assert_array_equal(found[:, -1], 1)
     assert 0 < found[0, 100] < 1
     far = vertex_error.distances(lambda marks, neutral: neutral + truth + 50, test, regions)

@@ -1,4 +1,4 @@
-"""How often each fault was tried, and what came of it; the README quotes the table.
+"""How often each fault was tried, and what came of it; docs/faults.md shows the table.
 
 FACEJAX_FAULT_TRIES and FACEJAX_FAULT_FILES are set by `make faults`; without them few are tried. Outcomes are added to
 the file that FACEJAX_FAULT_RECORD names.

@@ -1,4 +1,4 @@
-"""The outcomes that `make faults` recorded, as the README's table: `python tests/faults/table.py FILE`."""
+"""The outcomes that `make faults` recorded, as the table of docs/faults.md: `python tests/faults/table.py FILE`."""
 
 import json
 import sys

@@ -51,9 +51,9 @@ def test_names_and_shapes_that_are_wrong():
     networks = made("neutral")
     with pytest.raises(ValueError, match="'angr': did you mean anger"):
         expressions.displacements(networks, "angr")
-    with pytest.raises(ValueError, match="there are anger, fear"):
+    with pytest.raises(ValueError, match="expected one of anger, fear"):
         expressions.displacements(networks, "zzz")
-    with pytest.raises(ValueError, match=r"neutral: these networks need landmarks at rest, \(..., 6, 3\)"):
+    with pytest.raises(ValueError, match=r"neutral: expected landmarks at rest \(..., 6, 3\)"):
         expressions.displacements(networks, "anger")
     with pytest.raises(ValueError, match="neutral"):
         expressions.displacements(networks, "anger", np.zeros((5, 3)))

@@ -87,7 +87,7 @@ def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):
     # It sees no face, so that all of it goes into one program.
     traced = jax.jit(lambda marks, face: pipeline.meshes(again, marks, face))(marks, person.vertices)
     np.testing.assert_allclose(traced, expected, atol=1e-3)
-    with pytest.raises(ValueError, match="S2D-Dec cannot be told of it"):
+    with pytest.raises(ValueError, match="noise is not supported by S2D-Dec"):
         pipeline.meshes(again, marks, person.vertices, noise=0.5)
 
 
@@ -164,7 +164,7 @@ def test_samples_do_not_depend_on_how_many_are_drawn(models, person):
     ("labels", "options", "message"),
     [
         (["neutral", "high_smlie"], {}, "unknown label 'high_smlie': did you mean high_smile"),
-        (["neutral", "qqqq"], {}, "there are neutral, bareteeth"),
+        (["neutral", "qqqq"], {}, "expected one of neutral, bareteeth"),
         (["neutral"], {}, "a start and an end"),
         (["neutral", "anger", "anger"], {}, "'anger' follows itself"),
         (["neutral", "anger"], {"frames": 1}, "2 or more"),

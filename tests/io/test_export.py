@@ -5,13 +5,13 @@ import pytest
 from PIL import Image
 
 from facejax import io
-from facejax.viz import props
+from facejax.viz import eyes_teeth
 
 
 @pytest.mark.parametrize("name", ["a.glb", "a.html", "a.webp", "a.gif", "a.png", "a.npz", "frames/"])
 def test_an_animation_in_every_format(tmp_path, moving, name):
     vertices, faces = moving
-    eye = props.eyeball((0, 20, 80), 12)
+    eye = eyes_teeth.eyeball((0, 20, 80), 12)
     marks = np.arange(5)
     text = {"captions": ((0, "neutral → smile"), (3, "smile")), "landmarks": marks, "extras": (eye,)}
     io.save(f"{tmp_path}/{name}", vertices, faces, fps=20, size=(40, 50), **text)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from facejax import io
 from facejax.io import meshes
-from facejax.viz import props
+from facejax.viz import eyes_teeth
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 TWO = [0, 1, 2, 0, 2, 3]
@@ -83,7 +83,7 @@ def _read(folder, builder):
 
 def test_our_own_animation_comes_back_as_its_first_frame_in_metres(tmp_path, moving):
     vertices, faces = moving
-    eyes = (props.eyeball((-30, 20, 60), 12, sectors=8), props.eyeball((30, 20, 60), 12, sectors=8))
+    eyes = (eyes_teeth.eyeball((-30, 20, 60), 12, sectors=8), eyes_teeth.eyeball((30, 20, 60), 12, sectors=8))
     for name, frames in (("film.glb", vertices[2:]), ("still.glb", vertices[2])):
         io.save(tmp_path / name, frames, faces, extras=eyes)
         mesh = io.load_mesh(tmp_path / name)

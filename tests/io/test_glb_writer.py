@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from facejax.io import glb_writer
-from facejax.viz import props, scene
+from facejax.viz import eyes_teeth, scene
 
 
 def _parse(path):
@@ -84,7 +84,7 @@ def test_sparse_is_smaller_where_part_of_the_face_rests(tmp_path, moving):
 
 def test_extras_captions_and_names(tmp_path, moving):
     vertices, faces = moving
-    eye = props.eyeball((0, 20, 80), 12)
+    eye = eyes_teeth.eyeball((0, 20, 80), 12)
     ring = scene.Part(vertices[:, :50], np.array([[0, 1, 2]]), (1, 0, 0))
     captions = ((0, "neutral → joy"), (2, "joy"))
     glb_writer.write(tmp_path / "face.glb", vertices, faces, extras=(eye, ring), captions=captions, name="Ann")
@@ -114,7 +114,7 @@ def test_refuses_what_it_cannot_write(tmp_path, moving):
 def test_khronos_validator_has_nothing_to_say(tmp_path, moving, node):
     vertices, faces = moving
     resting = np.stack([vertices[0], vertices[0], vertices[1]])
-    eye = props.eyeball((0, 20, 80), 12)
+    eye = eyes_teeth.eyeball((0, 20, 80), 12)
     cases = [
         (vertices, {}),
         (vertices, {"normals": False}),
@@ -133,7 +133,7 @@ def test_khronos_validator_has_nothing_to_say(tmp_path, moving, node):
 @pytest.mark.browser
 def test_three_js_plays_the_same_motion(tmp_path, moving, browser):
     vertices, faces = moving
-    glb_writer.write(tmp_path / "face.glb", vertices, faces, fps=10, extras=(props.eyeball((0, 20, 80), 12),))
+    glb_writer.write(tmp_path / "face.glb", vertices, faces, fps=10, extras=(eyes_teeth.eyeball((0, 20, 80), 12),))
     chosen = [0, 7, len(vertices[0]) - 1, int(vertices[0, :, 2].argmax())]
     job = {"file": str(tmp_path / "face.glb"), "times": [0, 0.1, 0.25, 0.3], "vertices": chosen}
     answer = browser("open_glb.cjs", job, "three")

@@ -78,7 +78,7 @@ def test_a_file_with_another_topology_is_refused_as_a_mesh(topology, tmp_path):
 @pytest.mark.parametrize(("size", "unit"), [(231.0, "millimetres"), (0.147, "metres"), (12.0, "centimetres")])
 def test_the_unit_of_a_mesh_without_known_landmarks_is_told_by_its_size(size, unit):
     """Heads, and faces cut out of them: no size fits two units."""
-    millimetres, found = canonical_frame.unit_of_head(size, "it")
+    millimetres, found = canonical_frame.infer_head_unit(size, "it")
     assert found == unit and millimetres == canonical_frame.UNITS[unit]
     with pytest.raises(canonical_frame.FaceError, match="it: 41 in size; expected a head of 100 to 400 mm"):
-        canonical_frame.unit_of_head(41.0, "it")
+        canonical_frame.infer_head_unit(41.0, "it")

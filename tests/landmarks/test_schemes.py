@@ -166,4 +166,4 @@ def test_what_stays_put_lies_on_both_sides_of_the_upper_face(count):
     scheme = schemes.by_count(count)
     names = [scheme.points[i] for i in scheme.stable]
     assert len(names) >= 6 and not any("lip" in name or "brow" in name or name == "chin" for name in names)
-    assert {schemes.other_side(name) for name in names} == set(names)
+    assert {schemes.mirror_name(name) for name in names} == set(names)

@@ -41,7 +41,7 @@ def test_impossible_factors():
 def test_closest_point_against_dense_sampling():
     rng = np.random.default_rng(0)
     triangles, points = rng.normal(size=(40, 3, 3)), 2 * rng.normal(size=(40, 3))
-    found = decimation.closest_point(points, triangles)
+    found = closest_point.barycentric(points, triangles)
     assert found.min() >= 0 and np.allclose(found.sum(axis=1), 1)
     distance = np.linalg.norm(np.einsum("pc,pcx->px", found, triangles) - points, axis=1)
     u, v = np.meshgrid(np.linspace(0, 1, 101), np.linspace(0, 1, 101))
@@ -54,7 +54,7 @@ def test_closest_point_against_dense_sampling():
 
 def test_closest_point_of_flattened_triangles_is_on_their_longest_edge():
     line = np.array([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]], [[1.0, 1, 1], [1, 1, 1], [1, 1, 1]]])
-    found = decimation.closest_point(np.array([[2.0, 1, 0], [0, 0, 0]]), line)
+    found = closest_point.barycentric(np.array([[2.0, 1, 0], [0, 0, 0]]), line)
     np.testing.assert_allclose(np.einsum("pc,pcx->px", found, line), [[2, 0, 0], [1, 1, 1]], atol=1e-12)
 
 
@@ -70,7 +70,7 @@ def test_upsampling_against_every_triangle():
     triangles = vertices[kept][coarse]
     for vertex in range(0, len(vertices), 7):
         points = np.repeat(vertices[vertex][None], len(triangles), axis=0)
-        every = decimation.closest_point(points, triangles)
+        every = closest_point.barycentric(points, triangles)
         best = np.linalg.norm(np.einsum("tc,tcx->tx", every, triangles) - points, axis=1).min()
         assert np.linalg.norm(found[vertex] - vertices[vertex]) == pytest.approx(best, abs=1e-6)
     np.testing.assert_array_equal(found[kept], vertices[kept])

@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from facejax.mesh import deformation_transfer
+from facejax.mesh.deformation_transfer import DeformationTransfer, anchor_weights
 
 BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 N, FACES = len(BALL.vertices), np.asarray(BALL.faces)
@@ -53,9 +54,9 @@ def test_gradients_and_areas_are_those_of_the_plain_loop():
 def test_carried_fields_solve_the_stated_least_squares():
     source, target, fields = face(0), face(1), smooth(2, 3)
     motion = np.random.default_rng(3).uniform(0, 0.2, N)
-    found = deformation_transfer.DeformationTransfer(source, target, FACES, motion)(fields)
+    found = DeformationTransfer(source, target, FACES, anchor_weights(motion))(fields)
     areas = trimesh.Trimesh(target, FACES, process=False).area_faces
-    held = np.sqrt(deformation_transfer.HOLD * areas.mean() / (1 + (motion / deformation_transfer.STILL) ** 2))
+    held = np.sqrt(deformation_transfer.ANCHOR * areas.mean() / (1 + (motion / deformation_transfer.MOTION) ** 2))
     rows, wanted = [], []
     for corners, area in zip(FACES, areas, strict=True):
         row = np.zeros((3, N))
@@ -76,14 +77,14 @@ def test_carried_fields_solve_the_stated_least_squares():
 def test_to_the_same_face_nothing_changes(motion):
     fields = field(1, 4, N, 3)
     np.testing.assert_allclose(
-        deformation_transfer.DeformationTransfer(face(0), face(0), FACES, motion)(fields), fields, atol=1e-6
+        DeformationTransfer(face(0), face(0), FACES, anchor_weights(motion))(fields), fields, atol=1e-6
     )
 
 
 def test_translations_are_carried_as_they_are():
     fields = np.broadcast_to(field(1, 2, 1, 3), (2, N, 3))
     np.testing.assert_allclose(
-        deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N))(fields), fields, atol=1e-6
+        DeformationTransfer(face(0), face(1), FACES, anchor_weights(np.ones(N)))(fields), fields, atol=1e-6
     )
 
 
@@ -91,7 +92,7 @@ def test_an_affine_field_of_a_flat_patch_stays_affine():
     (source, faces), (target, _) = grid(0), grid(1)
     assert np.abs(source - target).max() > 0.2
     matrix = field(2, 3, 3)
-    found = deformation_transfer.DeformationTransfer(source, target, faces, np.full(len(source), 10.0))(
+    found = DeformationTransfer(source, target, faces, anchor_weights(np.full(len(source), 10.0)))(
         (source @ matrix)[None]
     )[0]
     # Where the whole lies gradients do not say; what the vertices are held to does: their mean stays.
@@ -101,7 +102,7 @@ def test_an_affine_field_of_a_flat_patch_stays_affine():
 
 def test_a_scaled_face_moves_scaled():
     fields = smooth(1, 2)
-    found = deformation_transfer.DeformationTransfer(face(0), 3 * face(0), FACES, MOVING)(fields)
+    found = DeformationTransfer(face(0), 3 * face(0), FACES, anchor_weights(MOVING))(fields)
     shift = (found - 3 * fields).mean(axis=1, keepdims=True)
     np.testing.assert_allclose(found - shift, 3 * fields, atol=1e-4)
 
@@ -109,13 +110,13 @@ def test_a_scaled_face_moves_scaled():
 def test_turned_faces_turn_what_is_carried():
     turn = np.linalg.qr(field(9, 3, 3))[0]
     fields, motion = smooth(1, 2), np.linspace(0, 2, N)
-    plain = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, motion)(fields)
-    turned = deformation_transfer.DeformationTransfer(face(0) @ turn, face(1) @ turn, FACES, motion)(fields @ turn)
+    plain = DeformationTransfer(face(0), face(1), FACES, anchor_weights(motion))(fields)
+    turned = DeformationTransfer(face(0) @ turn, face(1) @ turn, FACES, anchor_weights(motion))(fields @ turn)
     np.testing.assert_allclose(turned, plain @ turn, atol=1e-7)
 
 
 def test_fields_are_carried_each_for_itself_and_linearly():
-    carrier, fields = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N)), smooth(1, 3)
+    carrier, fields = DeformationTransfer(face(0), face(1), FACES, anchor_weights(np.ones(N))), smooth(1, 3)
     together = carrier(fields)
     assert together.shape == fields.shape
     for one, expected in zip(fields, together, strict=True):
@@ -126,16 +127,16 @@ def test_fields_are_carried_each_for_itself_and_linearly():
 def test_vertices_that_never_move_are_held():
     lower = np.asarray(BALL.vertices)[:, 2] < -0.3
     fields = np.where(lower[:, None], 0.0, smooth(1, 3))
-    held = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.where(lower, 0.0, 10.0))(fields)
-    free = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, MOVING)(fields)
+    held = DeformationTransfer(face(0), face(1), FACES, anchor_weights(np.where(lower, 0.0, 10.0)))(fields)
+    free = DeformationTransfer(face(0), face(1), FACES, anchor_weights(MOVING))(fields)
     # The gradients leave open where the whole lies: so that what was still stays where it was.
     held, free = (np.linalg.norm(carried[:, lower].mean(axis=1), axis=-1) for carried in (held, free))
     assert (held < 1e-4).all() and (free > 1e-2).all()
 
 
 def test_settled_fields_come_back():
-    there = deformation_transfer.DeformationTransfer(face(0), face(1), FACES, np.ones(N))
-    back = deformation_transfer.DeformationTransfer(face(1), face(0), FACES, np.ones(N))
+    there = DeformationTransfer(face(0), face(1), FACES, anchor_weights(np.ones(N)))
+    back = DeformationTransfer(face(1), face(0), FACES, anchor_weights(np.ones(N)))
     fields = smooth(1, 3)
     missing = [
         np.linalg.norm(back(deformation_transfer.invert(there, back, fields, rounds=rounds)) - fields, axis=-1).mean()
@@ -150,6 +151,6 @@ def test_settled_fields_come_back():
 
 def test_faces_of_different_shapes_are_named():
     with pytest.raises(ValueError, match=r"two faces of one shape .* got \(162, 3\), \(161, 3\) and \(162,\)"):
-        deformation_transfer.DeformationTransfer(face(0), face(1)[1:], FACES, MOVING)
+        DeformationTransfer(face(0), face(1)[1:], FACES, anchor_weights(MOVING))
     with pytest.raises(ValueError, match=r"a motion per vertex.* and \(161,\)"):
-        deformation_transfer.DeformationTransfer(face(0), face(1), FACES, MOVING[1:])
+        DeformationTransfer(face(0), face(1), FACES, anchor_weights(MOVING[1:]))

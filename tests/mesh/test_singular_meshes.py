@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from facejax.mesh import closest_point, decimation, deformation_transfer, spiral_conv, strain
+from facejax.mesh import closest_point, deformation_transfer, normals, strain
 from tests.near import COUNT, finite
 
 FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]], np.int32)  # three triangles about vertex 0
@@ -27,7 +27,7 @@ def fans():
 
 def test_normals(dtype):
     vertices = jnp.asarray(fans(), dtype)
-    found = np.asarray(finite(lambda vertices: spiral_conv.vertex_normals(vertices, FACES), vertices), np.float64)
+    found = np.asarray(finite(lambda vertices: normals.vertex_normals(vertices, FACES), vertices), np.float64)
     length = np.linalg.norm(found, axis=-1)
     assert (np.minimum(np.abs(length - 1), length) < 8 * np.finfo(dtype).eps).all()
     assert (length[:150] == 0).all() and (length[154::5] > 0).all()
@@ -56,7 +56,7 @@ def test_the_nearest_point_of_a_triangle():
     triangles = fans()[:, :3]
     size = np.ptp(triangles, axis=(1, 2))
     points = triangles.mean(axis=1) + (size * 10.0 ** rng.uniform(-9, 1, COUNT))[:, None] * rng.normal(size=(COUNT, 3))
-    weights = decimation.closest_point(points, triangles)
+    weights = closest_point.barycentric(points, triangles)
     assert (weights >= 0).all() and (weights <= 1).all()
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-12)
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from jax.test_util import check_grads
 
-from facejax.mesh import hierarchy, spiral_conv
+from facejax.mesh import hierarchy, normals, spiral_conv
 
 BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 HIERARCHY = hierarchy.build(np.asarray(BALL.vertices), np.asarray(BALL.faces), factors=(4,), lengths=(9,), reference=0)
@@ -112,7 +112,7 @@ def test_wrong_shapes_are_named():
 @pytest.mark.parametrize("lead", [(), (1,), (3, 2)])
 def test_normals_against_area_weighted_sums(lead):
     vertices = jnp.asarray(BALL.vertices, jnp.float32) + 0.05 * array(1, *lead, 162, 3)
-    found = spiral_conv.vertex_normals(vertices, BALL.faces)
+    found = normals.vertex_normals(vertices, BALL.faces)
     for index in np.ndindex(*lead):
         expected = np.zeros((162, 3))
         for a, b, c in BALL.faces:
@@ -124,18 +124,18 @@ def test_normals_against_area_weighted_sums(lead):
 
 def test_normals_point_outwards_and_turn_with_the_mesh():
     vertices = jnp.asarray(BALL.vertices, jnp.float32)
-    normals = spiral_conv.vertex_normals(vertices, BALL.faces)
+    normals = normals.vertex_normals(vertices, BALL.faces)
     assert float(jnp.min(jnp.sum(normals * vertices, axis=1))) > 0.99
     turn = jnp.linalg.qr(array(1, 3, 3))[0]
     turn = turn * jnp.sign(jnp.linalg.det(turn))
-    np.testing.assert_allclose(spiral_conv.vertex_normals(vertices @ turn, BALL.faces), normals @ turn, atol=1e-5)
+    np.testing.assert_allclose(normals.vertex_normals(vertices @ turn, BALL.faces), normals @ turn, atol=1e-5)
 
 
 def test_normals_of_a_flat_point_are_zero_with_finite_gradients():
     faces = np.array([[0, 1, 2]])
-    slope = jax.grad(lambda v: jnp.sum(spiral_conv.vertex_normals(v, faces)))(jnp.zeros((3, 3)))
-    assert not spiral_conv.vertex_normals(jnp.zeros((3, 3)), faces).any() and jnp.isfinite(slope).all()
+    slope = jax.grad(lambda v: jnp.sum(normals.vertex_normals(v, faces)))(jnp.zeros((3, 3)))
+    assert not normals.vertex_normals(jnp.zeros((3, 3)), faces).any() and jnp.isfinite(slope).all()
     check_grads(
-        lambda v: jnp.sum(jnp.sin(3 * spiral_conv.vertex_normals(v, BALL.faces))),
+        lambda v: jnp.sum(jnp.sin(3 * normals.vertex_normals(v, BALL.faces))),
         (jnp.asarray(BALL.vertices, jnp.float32),), order=1, atol=5e-2, rtol=5e-2, eps=1e-3,
     )  # fmt: skip

@@ -30,7 +30,7 @@ def params():
 
 @pytest.fixture(scope="module")
 def two():
-    return morphable.fit_two(planted(6), planted(30, seed=1, noise=0.2) - 50, identity=3, expression=5)
+    return morphable.fit_identity_expression(planted(6), planted(30, seed=1, noise=0.2) - 50, identity=3, expression=5)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -186,7 +186,7 @@ def test_each_of_the_two_is_a_model_of_its_own(two):
 
 def test_people_and_expressions_in_the_models_are_given_back():
     neutral, displacements = planted(6), planted(9, seed=1) - planted(9, seed=2)
-    two = morphable.fit_two(neutral, displacements, identity=5, expression=8)
+    two = morphable.fit_identity_expression(neutral, displacements, identity=5, expression=8)
     who = morphable.project(two.identity, neutral[2])
     made = morphable.face(two, who, morphable.project(two.expression, displacements))
     np.testing.assert_allclose(made, neutral[2] + displacements, atol=1e-4)
@@ -232,12 +232,12 @@ def test_components_for_is_the_least_number_that_keeps_the_share():
         (lambda x: morphable.direction(x, np.full(M, np.inf)), "scores: expected finite numbers, got inf"),
         (lambda x: morphable.direction(x, np.full(M, 0.1), unit=True), "scores: expected at least two .* got 0.1 for"),
         (lambda x: morphable.direction(x[0], np.ones(N)), r"examples: expected \(M, N, C\)"),
-        (lambda x: morphable.fit_two(x, x[:, 1:], identity=1, expression=1), r"got \(40, 12, 3\) and \(40, 11, 3\)"),
-        (lambda x: morphable.fit_two(x[..., :2], x[..., :2], identity=1, expression=1), r"expected \(P, N, 3\) and"),
-        (lambda x: morphable.fit_two(x[0], x, identity=1, expression=1), r"neutral: expected \(M, N, C\)"),
-        (lambda x: morphable.fit_two(x, 0 * x, identity=1, expression=1), "displacements: .* differ, got 40 alike"),
-        (lambda x: morphable.fit_two(x, x[:4], identity=5, expression=4), "expression: expected 1 to 3 .* got 4"),
-        (lambda x: morphable.fit_two(x[:4], x, identity=5, expression=4), "identity: expected 1 to 3 .* got 5"),
+        (lambda x: morphable.fit_identity_expression(x, x[:, 1:], identity=1, expression=1), r"got \(40, 12, 3\) and \(40, 11, 3\)"),
+        (lambda x: morphable.fit_identity_expression(x[..., :2], x[..., :2], identity=1, expression=1), r"expected \(P, N, 3\) and"),
+        (lambda x: morphable.fit_identity_expression(x[0], x, identity=1, expression=1), r"neutral: expected \(M, N, C\)"),
+        (lambda x: morphable.fit_identity_expression(x, 0 * x, identity=1, expression=1), "displacements: .* differ, got 40 alike"),
+        (lambda x: morphable.fit_identity_expression(x, x[:4], identity=5, expression=4), "expression: expected 1 to 3 .* got 4"),
+        (lambda x: morphable.fit_identity_expression(x[:4], x, identity=5, expression=4), "identity: expected 1 to 3 .* got 5"),
     ],
 )
 def test_wrong_examples_are_named(call, message):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facejax.viz import html_viewer, props, scene
+from facejax.viz import eyes_teeth, html_viewer, scene
 
 NASTY = '</script><img src=x onerror="window.stolen=1"><!-- $title & "quotes" \u2028'
 
@@ -54,7 +54,7 @@ def test_extreme_steps_do_not_overflow(tmp_path, ball):
 
 def test_parts_and_colours(tmp_path, moving):
     vertices, faces = moving
-    eye = props.eyeball((0, 20, 80), 12)
+    eye = eyes_teeth.eyeball((0, 20, 80), 12)
     tint = np.linspace(0, 1, vertices.shape[1] * 3).reshape(-1, 3)
     html_viewer.write(tmp_path / "face.html", vertices, faces, extras=(eye,), colours=tint)
     text = (tmp_path / "face.html").read_text("utf-8")

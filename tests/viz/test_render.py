@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facejax.viz import props, render, scene, shading
+from facejax.viz import eyes_teeth, render, scene, shading
 
 SIZE = (64, 80)
 
@@ -70,12 +70,12 @@ def test_the_neck_is_stopped_but_a_mask_is_not(ball):
     vertices, faces = ball
     centre = vertices[faces].mean(1)
     mask = faces[centre[:, 1] > -60]
-    assert len(props.close_largest_hole(vertices, faces)) == 0 and len(props.close_largest_hole(vertices, mask)) == 0
+    assert len(render.close_largest_hole(vertices, faces)) == 0 and len(render.close_largest_hole(vertices, mask)) == 0
     two_holes = mask[centre[centre[:, 1] > -60][:, 1] < 76]
-    closing = props.close_largest_hole(vertices, two_holes)
+    closing = render.close_largest_hole(vertices, two_holes)
     assert (vertices[closing][..., 1] < 0).all()
     # Closing the neck leaves one hole, and every new edge is used once in each direction.
-    assert len(props.close_largest_hole(vertices, np.concatenate([two_holes, closing]))) == 0
+    assert len(render.close_largest_hole(vertices, np.concatenate([two_holes, closing]))) == 0
     edges = np.concatenate([closing[:, [0, 1]], closing[:, [1, 2]], closing[:, [2, 0]]]).tolist()
     old = np.concatenate([two_holes[:, [0, 1]], two_holes[:, [1, 2]], two_holes[:, [2, 0]]]).tolist()
     assert all([b, a] in edges or [b, a] in old for a, b in edges)
@@ -132,7 +132,7 @@ def test_normals_equal_a_loop_and_point_out_of_a_sphere(ball):
 
 def test_an_eyeball_looks_where_it_is_told():
     for gaze in ((0, 0, 1), (1, 0.5, 1), (0, 1, 0)):
-        eye = props.eyeball((1, 2, 3), 12.0, gaze=gaze)
+        eye = eyes_teeth.eyeball((1, 2, 3), 12.0, gaze=gaze)
         away = eye.vertices - [1, 2, 3]
         np.testing.assert_allclose(np.linalg.norm(away, axis=1), 12, rtol=1e-5)
         pupil = away[eye.colour.max(1) < 0.05].mean(0)
@@ -140,9 +140,9 @@ def test_an_eyeball_looks_where_it_is_told():
         corner = eye.vertices[eye.faces]
         facing = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         assert (np.einsum("fx,fx->f", facing, corner.mean(1) - [1, 2, 3]) > -1e-6).all()
-    assert props.eyeball(np.zeros((4, 3)), 12.0).vertices.shape == (4, *eye.vertices.shape)
+    assert eyes_teeth.eyeball(np.zeros((4, 3)), 12.0).vertices.shape == (4, *eye.vertices.shape)
     with pytest.raises(ValueError, match="iris_radius"):
-        props.eyeball((0, 0, 0), 5.0)
+        eyes_teeth.eyeball((0, 0, 0), 5.0)
 
 
 def test_contact_sheet_and_caption(ball):

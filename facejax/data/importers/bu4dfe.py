@@ -1,7 +1,7 @@
-"""BU-4DFE: `ROOT/F001/Angry/000.bnd`, 83 landmarks a frame and no registered meshes; 101 people x 6, 25 a second.
+"""BU-4DFE: `ROOT/F001/Angry/000.bnd`, 83 landmarks per frame, no registered meshes; 101 people x 6, 25 frames/s.
 
-A .bnd holds a row `vertex x y z` for each landmark, in millimetres; the vertices are those of the raw scan. F001 is a
-woman, M001 a man. The store holds landmarks alone, for generators of motion.
+A .bnd file has a row `vertex x y z` for each landmark, in millimetres; vertices refer to the raw scan. F001 is a woman,
+M001 a man. The dataset contains only landmarks, for motion generators.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ _SEX = {"F": "female", "M": "male"}
 
 
 def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
-    """The recordings of the people. Raises `SourceError`, naming the file; options as in `tree.scan`."""
+    """List the recordings; options as in `folder_scan.scan`. Raises `SourceError`, naming the file."""
     root = Path(root)
     if rest not in folder_scan.REST_OPTIONS:
         raise SourceError(f"rest: expected {' or '.join(folder_scan.REST_OPTIONS)}, got {rest!r}")
-    people, takes, notes = [], [], []
+    people, recordings, notes = [], [], []
     for folder in folder_scan.list_folders(root, "F001/Angry/000.bnd"):
         match = _NAME.fullmatch(folder.name)
         if match is None:
-            notes.append(f"passed over, as no person's folder (F001): {folder.name}")
+            notes.append(f"skipped {folder.name}, not a subject's folder (F001)")
             continue
         own = []
         for path in folder_scan.list_folders(folder, "Angry/000.bnd"):
             frames = tuple(p for p in folder_scan.list_entries(path) if p.suffix.lower() == ".bnd")
             if not frames:
-                raise SourceError(f"{path}: holds no landmarks; expected 000.bnd and so on")
+                raise SourceError(f"{path}: contains no landmarks; expected 000.bnd and so on")
             notes += base.check_frame_numbers(frames, gaps=gaps)
             label = base.label_from_name(path.name)
             own.append(RecordingInfo(len(people), label, f"{folder.name}/{path.name}", path, frames, len(frames)))
         people.append(Person(folder.name, {"sex": _SEX[match[1].upper()]}))
-        takes += own
+        recordings += own
     if not people:
-        raise SourceError(f"{root}: holds no people's folders (F001 to F058, M001 to M043)")
+        raise SourceError(f"{root}: contains no subjects' folders (F001 to F058, M001 to M043)")
     return Source(
         "bu4dfe",
         root,
         tuple(people),
-        tuple(takes),
+        tuple(recordings),
         read_frames,
-        functools.partial(_rest, tuple(takes), rest),
-        tuple(path for take in takes for path in take.frames),
+        functools.partial(_neutral_frames, tuple(recordings), rest),
+        tuple(path for recording in recordings for path in recording.frame_paths),
         rate,
         unit="mm",
         landmarks=np.arange(LANDMARKS),
@@ -63,9 +63,9 @@ def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", ga
     )
 
 
-def read_frames(take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Frame]:
-    """Each frame's landmarks (83, 3). Raises `SourceError`, naming file and line."""
-    for path in take.frames if which is None else [take.frames[i] for i in which]:
+def read_frames(recording: RecordingInfo, frames: Sequence[int] | None) -> Iterator[Frame]:
+    """Yield the landmarks (83, 3) of the given frames, or all for None. Raises `SourceError`, naming file and line."""
+    for path in recording.frame_paths if frames is None else [recording.frame_paths[i] for i in frames]:
         try:
             found = landmarks.read(path)
         except landmarks.LandmarkError as error:
@@ -75,7 +75,7 @@ def read_frames(take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Fr
         yield str(path), meshes.Mesh(found.points, None)
 
 
-def _rest(takes: tuple[RecordingInfo, ...], rest: str, subject: int) -> Iterator[Frame]:
-    own = [take for take in takes if take.subject == subject]
-    for take in own[:1] if rest == "first" else own:
-        yield next(read_frames(take, [0]))
+def _neutral_frames(recordings: tuple[RecordingInfo, ...], rest: str, subject: int) -> Iterator[Frame]:
+    own = [recording for recording in recordings if recording.subject == subject]
+    for recording in own[:1] if rest == "first" else own:
+        yield next(read_frames(recording, [0]))

@@ -16,12 +16,13 @@ FRAMES, APEX = 60, 30
 
 
 def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
-    """The recordings of the people. Raises `SourceError`: see `tree.scan`.
+    """List the recordings. Raises `SourceError` as `folder_scan.scan`.
 
-    The paper leaves out 30 women and 10 men: a table of people says who is which (`sex`).
+    The paper holds out 30 women and 10 men; a table of people provides the column `sex`.
     """
     found = folder_scan.scan(Path(root), layout="florence4d", rate=rate, rest=rest, step=1, gaps=gaps)
-    takes = [take._replace(cuts=(0, APEX, APEX, FRAMES - 1)) if take.count == FRAMES else take for take in found.takes]
-    odd = [take.name for take in takes if take.cuts is None]
-    said = [f"{len(odd)} recordings have not {FRAMES} frames, their apex was looked for: {', '.join(odd[:3])}"]
-    return found._replace(takes=tuple(takes), notes=(*found.notes, *said * bool(odd)))
+    phases = (0, APEX, APEX, FRAMES - 1)
+    recordings = [one._replace(phases=phases) if one.num_frames == FRAMES else one for one in found.recordings]
+    odd = [one.name for one in recordings if one.phases is None]
+    notes = (f"{len(odd)} recordings do not have {FRAMES} frames, their apex was detected: {', '.join(odd[:3])}",)
+    return found._replace(recordings=tuple(recordings), notes=found.notes + (notes if odd else ()))

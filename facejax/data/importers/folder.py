@@ -1,4 +1,4 @@
-"""A user's own registered 4D meshes, read from folders (`facejax.data.tree` shows how they lie) into a store."""
+"""A user's own registered 4D meshes in folders; `facejax.data.importers.folder_scan` documents the layout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from facejax.data.importers.base import Source
 
 
 def scan(root: str | os.PathLike, *, rate: float = 30.0, rest: str = "first", gaps: bool = False) -> Source:
-    """Recordings of any names, their frames numbered in any even steps; see `tree.scan`."""
+    """List recordings of any names, with frame numbers in any regular steps; see `folder_scan.scan`."""
     return folder_scan.scan(Path(root), rate=rate, rest=rest, gaps=gaps)
 
 
@@ -25,9 +25,10 @@ def prepare(
     max_meshes: int = ingest.MAX_MESHES,
     progress: ingest.Progress | None = None,
 ) -> dataset.Dataset:
-    """`scan` and `ingest.prepare` in one: the meshes under `root` in a new store at `out`.
+    """Import the meshes under `root` into a new dataset at `out`: `scan`, then `ingest.prepare`.
 
-    Raises `SourceError`, and leaves nothing, where something is wrong with the meshes.
+    Raises:
+      SourceError: the meshes cannot be used; nothing is left at `out`.
     """
     request = ingest.Request(Path(landmarks), unit, max_meshes)
     return ingest.prepare(scan(root, rate=float(rate)), out, request, progress=progress)

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from facejax.data import dataset
-from facejax.data.importers import base, worker
+from facejax.data.importers import apex_detection, base, worker
 from facejax.data.importers.base import Source, SourceError
 from facejax.data.synthetic import makehuman4d
 from facejax.io import atomic, landmarks
@@ -237,7 +237,7 @@ def _faceless(points: np.ndarray, path: Path | None) -> list[str]:
     except ValueError:
         return []
     try:
-        canonical_frame.place(points[here], known[there])
+        canonical_frame.align_to_template(points[here], known[there])
     except ValueError as error:
         return [f"{path}: {error}; they are taken as they are"]
     return []
@@ -247,7 +247,7 @@ def _unit(shared: base.ReferenceMesh, index: np.ndarray, unit: str | None) -> tu
     """The unit's name and its millimetres: as named, by 68 landmarks, or by the size of the whole mesh."""
     points, size = shared.vertices[index], base.bounding_box_size(shared.vertices)
     known = canonical_frame.template68()
-    spread = canonical_frame.spread(points) / canonical_frame.spread(known) if len(index) == len(known) else None
+    spread = canonical_frame.centred_norm(points) / canonical_frame.centred_norm(known) if len(index) == len(known) else None
     if unit is not None:
         scale = canonical_frame.UNITS[UNITS[unit]]
         fits = SIZE_RANGE_MM[0] < size * scale < SIZE_RANGE_MM[1] and (spread is None or SPREAD_RATIO_RANGE[0] < spread * scale < SPREAD_RATIO_RANGE[1])
@@ -256,9 +256,9 @@ def _unit(shared: base.ReferenceMesh, index: np.ndarray, unit: str | None) -> tu
         return UNITS[unit], scale
     try:
         scale, name = (
-            canonical_frame.unit_of_head(size, shared.name)
+            canonical_frame.infer_head_unit(size, shared.name)
             if spread is None
-            else canonical_frame.unit_of(spread, shared.name)
+            else canonical_frame.infer_unit(spread, shared.name)
         )
     except canonical_frame.FaceError as error:
         raise SourceError(f"{error}; or name the unit: {', '.join(UNITS)}") from error

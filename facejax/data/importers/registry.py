@@ -1,4 +1,4 @@
-"""Every dataset that can be prepared, by the name of its layout, and the tables that a user may put beside it."""
+"""All importers by the name of their layout, and tables that override labels, people and phases."""
 
 from __future__ import annotations
 
@@ -52,78 +52,80 @@ def prepare(
     progress: ingest.Progress | None = None,
     **options: Any,
 ) -> dataset.Dataset:
-    """Read a user's recordings into a new store at `out`; called again after an interruption, it goes on.
+    """Import recordings into a new dataset at `out`; called again after an interruption, it resumes.
 
     Args:
       layout: one of `SCANS`.
       root: the folder of the recordings.
-      out: of the store; it must not be there yet.
-      landmarks, unit, most, workers, progress: see `ingest.prepare`.
-      labels, people, cuts: tables; see `with_labels`, `with_people` and `read_phases`.
-      hold: take the head's rigid motion out.
-      options: the layout's own; those that are None are left to it.
+      out: the folder of the dataset; it must not exist.
+      landmarks, unit, max_meshes, workers, progress: see `ingest.prepare`.
+      labels, people, phases: tables; see `with_labels`, `with_people` and `read_phases`.
+      remove_head_motion: remove the rigid motion of the head.
+      options: of the layout; those that are None keep their defaults.
 
     Raises:
-      SourceError: something is wrong with the recordings or the request; nothing is left then.
+      SourceError: the recordings or the request cannot be used; nothing is left at `out`.
     """
-    found = scan(layout, root, **options)
+    source = scan(layout, root, **options)
     if labels is not None:
-        found = with_labels(found, labels)
+        source = with_labels(source, labels)
     if people is not None:
-        found = with_people(found, people)
-    named = {} if phases is None else read_phases(found, phases)
-    request = ingest.Request(landmarks, unit, max_meshes, remove_head_motion, named)
-    return ingest.prepare(found, out, request, workers=workers, progress=progress)
+        source = with_people(source, people)
+    known = {} if phases is None else read_phases(source, phases)
+    request = ingest.Request(landmarks, unit, max_meshes, remove_head_motion, known)
+    return ingest.prepare(source, out, request, workers=workers, progress=progress)
 
 
 def scan(layout: str, root: Path, **options: Any) -> Source:
-    """The recordings of a layout; options that are None are left to it.
+    """List the recordings of a layout; options that are None keep their defaults.
 
-    Raises `SourceError` for an unknown layout, for an option that it has not, and for one that it needs.
+    Raises:
+      SourceError: the layout is unknown, does not support an option, or requires one that is not given.
     """
     if layout not in SCANS:
         raise SourceError(f"unknown layout {layout!r}, expected one of {', '.join(SCANS)}")
     given = {name: value for name, value in options.items() if value is not None and value is not False}
     known = inspect.signature(SCANS[layout]).parameters
-    if foreign := [name for name in given if name not in known]:
-        raise SourceError(f"{layout}: has no --{foreign[0]}")
-    needed = [name for name, option in known.items() if option.default is option.empty and name != "root"]
-    if lacking := [name for name in needed if name not in given]:
-        raise SourceError(f"{layout}: needs --{lacking[0]}")
+    if unsupported := [name for name in given if name not in known]:
+        raise SourceError(f"--{unsupported[0]} is not supported by the {layout} importer")
+    required = [name for name, option in known.items() if option.default is option.empty and name != "root"]
+    if missing := [name for name in required if name not in given]:
+        raise SourceError(f"--{missing[0]} is required by the {layout} importer")
     return SCANS[layout](root, **given)
 
 
-def with_labels(found: Source, path: Path) -> Source:
-    """Other labels, from a table of subject, recording and label. Raises `SourceError`, naming the line."""
+def with_labels(source: Source, path: Path) -> Source:
+    """Replace labels by those of a table of subject, recording and label. Raises `SourceError`, naming the line."""
     rows = tables.read(path, ("subject", "recording", "label"), ())
-    at = apex_detection.match_rows(rows, found.takes, [who.name for who in found.people])
-    takes = list(found.takes)
-    for number, row in at.items():
+    recordings = list(source.recordings)
+    matched = apex_detection.match_rows(rows, source.recordings, [person.name for person in source.people])
+    for number, row in matched.items():
         if ">" in (label := row.values["label"].lower()):
-            raise SourceError(f"{row.where}: a label cannot hold '>'")
-        takes[number] = takes[number]._replace(label=label)
-    return found._replace(takes=tuple(takes))
+            raise SourceError(f"{row.location}: a label must not contain '>'")
+        recordings[number] = recordings[number]._replace(label=label)
+    return source._replace(recordings=tuple(recordings))
 
 
-def with_people(found: Source, path: Path) -> Source:
-    """What a table says of people: subject and any other columns, of which `split` says where each serves.
+def with_people(source: Source, path: Path) -> Source:
+    """Add attributes of people from a table of subject and any other columns; `split` assigns people to splits.
 
-    Raises `SourceError`, naming the line: nobody is called so, or a split is unknown.
+    Raises:
+      SourceError: naming the line; a subject is unknown, or `split` or `sex` has an unknown value.
     """
-    about = {who.name: dict(who.about) for who in found.people}
+    attributes = {person.name: dict(person.attributes) for person in source.people}
     for row in tables.read(path, ("subject",)):
         values = dict(row.values)
-        if (name := values.pop("subject")) not in about:
-            raise SourceError(f"{row.where}: nobody is called {name!r}")
+        if (name := values.pop("subject")) not in attributes:
+            raise SourceError(f"{row.location}: unknown subject {name!r}")
         if values.get("split", dataset.SPLITS[0]) not in dataset.SPLITS:
-            raise SourceError(f"{row.where}: split: expected {', '.join(dataset.SPLITS)}, got {values['split']!r}")
+            raise SourceError(f"{row.location}: split: expected {', '.join(dataset.SPLITS)}, got {values['split']!r}")
         if values.get("sex", SEXES[0]) not in SEXES:
-            raise SourceError(f"{row.where}: sex: expected {' or '.join(SEXES)}, got {values['sex']!r}")
-        about[name] |= {key: value for key, value in values.items() if key != "name"}
-    return found._replace(people=tuple(Person(who.name, about[who.name]) for who in found.people))
+            raise SourceError(f"{row.location}: sex: expected {' or '.join(SEXES)}, got {values['sex']!r}")
+        attributes[name] |= {key: value for key, value in values.items() if key != "name"}
+    return source._replace(people=tuple(Person(person.name, attributes[person.name]) for person in source.people))
 
 
-def read_phases(found: Source, path: Path) -> dict[int, apex_detection.Phases]:
-    """The cuts of recordings, by number, from a table of subject, recording and `cuts.Cuts`' fields."""
+def read_phases(source: Source, path: Path) -> dict[int, apex_detection.Phases]:
+    """Return phases by recording number, from a table of subject, recording and the fields of `Phases`."""
     rows = tables.read(path, ("subject", "recording", *apex_detection.Phases._fields), ())
-    return apex_detection.phases_from_table(rows, found.takes, [who.name for who in found.people])
+    return apex_detection.phases_from_table(rows, source.recordings, [person.name for person in source.people])

@@ -1,10 +1,10 @@
-"""VOCASET (Cudeiro et al. 2019): speech, 12 people, 60 frames a second, in metres and FLAME's topology.
+"""VOCASET (Cudeiro et al. 2019): speech, 12 people, 60 frames per second, in metres and FLAME's topology.
 
     ROOT/data_verts.npy          (rows, 5023, 3), memory-mapped
     ROOT/subj_seq_to_idx.pkl     {subject: {"sentence01": {frame: row}}}
-    ROOT/templates.pkl           {subject: (5023, 3)}, each at rest
+    ROOT/templates.pkl           {subject: (5023, 3)}, neutral
 
-The triangles lie in none of them: a mesh of the same topology (FLAME's sample, say) brings them.
+None of them contains the triangles: they come from a mesh of the same topology, such as FLAME's sample.
 """
 
 from __future__ import annotations
@@ -26,51 +26,48 @@ FILES = ("data_verts.npy", "subj_seq_to_idx.pkl", "templates.pkl")
 
 
 def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = RATE, gaps: bool = False) -> Source:
-    """The sentences of the people. Raises `SourceError`, naming file, person, sentence and frame.
+    """List the sentences. `template` is a mesh of the same topology, for its triangles.
 
-    `template`: a mesh in the same topology, for its triangles.
+    Raises:
+      SourceError: naming file, person, sentence and frame.
     """
     root, template = Path(root), Path(template)
     paths = [root / name for name in FILES]
-    if lacking := [path for path in paths if not path.is_file()]:
-        raise SourceError(f"{lacking[0]}: no such file; expected {', '.join(FILES)}")
+    if missing := [path for path in paths if not path.is_file()]:
+        raise SourceError(f"{missing[0]}: no such file; expected {', '.join(FILES)}")
     try:
         vertices = npz.map_npy(paths[0])
-        index, rests = (safe_pickle.read(path) for path in paths[1:])
+        index, templates = (safe_pickle.read(path) for path in paths[1:])
     except (safe_pickle.PickleError, OSError) as error:
         raise SourceError(str(error)) from error
     except ValueError as error:
         raise SourceError(f"{paths[0]}: {error}") from error
     if vertices.ndim != 3 or vertices.shape[2] != 3:
-        raise SourceError(f"{paths[0]}: expected (rows, N, 3), got {vertices.shape}")
+        raise SourceError(f"{paths[0]}: expected shape (rows, N, 3), got {vertices.shape}")
     topology = folder_scan.read_mesh(template)
     if topology.faces is None or len(topology.vertices) != vertices.shape[1]:
         raise SourceError(
-            f"{template}: expected a mesh of {vertices.shape[1]} vertices with triangles, as {FILES[0]} has, "
-            f"got {len(topology.vertices)}"
+            f"{template}: expected a mesh with triangles and {vertices.shape[1]} vertices as in {FILES[0]}, "
+            f"got {len(topology.vertices)} vertices"
         )
-    people, takes, still, notes = [], [], [], []
-    for name, sentences in sorted(_dict(index, paths[1]).items(), key=lambda row: base.natural_sort_key(str(row[0]))):
-        still.append(_rest_of(rests, name, vertices.shape[1], paths[2]))
-        for sentence, frames in sorted(
-            _dict(sentences, paths[1], name).items(), key=lambda r: base.natural_sort_key(r[0])
-        ):
-            where = f"{paths[1]}: {name}/{sentence}"
-            rows, odd = _rows(_dict(frames, paths[1], name, sentence), len(vertices), where, gaps)
-            notes += odd
-            take = RecordingInfo(
-                len(people), base.label_from_name(sentence), f"{name}/{sentence}", Path(name) / sentence, (), len(rows)
-            )
-            takes.append((take, rows))
+    people, recordings, rows_of, neutral, notes = [], [], {}, [], []
+    for name, sentences in _sorted(_dict(index, paths[1])):
+        neutral.append(_neutral(templates, name, vertices.shape[1], paths[2]))
+        for sentence, frames in _sorted(_dict(sentences, paths[1], name)):
+            location = f"{paths[1]}: {name}/{sentence}"
+            rows, gap_notes = _rows(_dict(frames, paths[1], name, sentence), len(vertices), location, gaps)
+            notes += gap_notes
+            label, full_name = base.label_from_name(sentence), f"{name}/{sentence}"
+            recordings.append(RecordingInfo(len(people), label, full_name, Path(name) / sentence, (), len(rows)))
+            rows_of[full_name] = rows
         people.append(Person(str(name), {}))
-    table = {take.name: rows for take, rows in takes}
     return Source(
         "vocaset",
         root,
         tuple(people),
-        tuple(take for take, _ in takes),
-        functools.partial(_read, paths[0], table),
-        functools.partial(_rest, paths[2], tuple(still)),
+        tuple(recordings),
+        functools.partial(_read_frames, paths[0], rows_of),
+        functools.partial(_neutral_frames, paths[2], tuple(neutral)),
         tuple(paths),
         rate,
         faces=topology.faces,
@@ -78,27 +75,26 @@ def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = 
     )
 
 
-def _rows(frames: dict, count: int, where: str, gaps: bool) -> tuple[np.ndarray, list[str]]:
-    """The rows (T,) of a sentence's frames, in their order, and what is odd."""
+def _rows(frames: dict, count: int, location: str, gaps: bool) -> tuple[np.ndarray, list[str]]:
+    """Return the rows (T,) of a sentence in the order of its frames, and notes on missing frames."""
     try:
         pairs = sorted((int(frame), int(row)) for frame, row in frames.items())
     except (TypeError, ValueError) as error:
-        raise SourceError(f"{where}: expected frames and rows, got {error}") from error
+        raise SourceError(f"{location}: expected integer frames and rows, got {error}") from error
     numbers, rows = np.array(pairs).T
-    if bad := [f"frame {n} is row {r}" for n, r in pairs if not 0 <= r < count]:
-        raise SourceError(f"{where}: {bad[0]}, expected 0 to {count - 1}")
-    wide = np.flatnonzero(np.diff(numbers) > 1)
-    said = [f"{where}: frame {numbers[i] + 1} is missing" for i in wide]
-    if said and not gaps:
-        raise SourceError(f"{said[0]}; --gaps takes the frames as they are")
-    return rows, said
+    if bad := [f"frame {n} has row {r}" for n, r in pairs if not 0 <= r < count]:
+        raise SourceError(f"{location}: {bad[0]}, expected 0 to {count - 1}")
+    notes = [f"{location}: frame {numbers[i] + 1} is missing" for i in np.flatnonzero(np.diff(numbers) > 1)]
+    if notes and not gaps:
+        raise SourceError(f"{notes[0]}; use --gaps to import the existing frames")
+    return rows, notes
 
 
-def _rest_of(rests: Any, name: str, count: int, path: Path) -> np.ndarray:
-    """A person's mesh at rest (N, 3)."""
-    found = _dict(rests, path).get(name)
+def _neutral(templates: Any, name: str, count: int, path: Path) -> np.ndarray:
+    """Return a person's neutral mesh (N, 3)."""
+    found = _dict(templates, path).get(name)
     if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu":
-        raise SourceError(f"{path}: holds no template of {name}")
+        raise SourceError(f"{path}: contains no template of {name}")
     if found.shape != (count, 3):
         raise SourceError(f"{path}: {name}: expected ({count}, 3) vertices, got {found.shape}")
     if len(bad := np.flatnonzero(~np.isfinite(found).all(axis=1))):
@@ -108,20 +104,26 @@ def _rest_of(rests: Any, name: str, count: int, path: Path) -> np.ndarray:
 
 def _dict(value: Any, path: Path, *keys: str) -> dict:
     if not isinstance(value, dict) or not value:
-        raise SourceError(f"{path}: {'/'.join(keys) or 'the whole'}: expected a dict with entries")
+        raise SourceError(f"{path}: {'/'.join(map(str, keys)) or 'top level'}: expected a dict with entries")
     return value
 
 
-def _read(path: Path, table: dict[str, np.ndarray], take: RecordingInfo, which: Sequence[int] | None) -> Iterator[Frame]:
-    vertices, rows = npz.map_npy(path), table[take.name]
-    for i in range(len(rows)) if which is None else which:
+def _sorted(entries: dict) -> list[tuple[Any, Any]]:
+    return sorted(entries.items(), key=lambda entry: base.natural_sort_key(str(entry[0])))
+
+
+def _read_frames(
+    path: Path, rows_of: dict[str, np.ndarray], recording: RecordingInfo, frames: Sequence[int] | None
+) -> Iterator[Frame]:
+    vertices, rows = npz.map_npy(path), rows_of[recording.name]
+    for i in range(len(rows)) if frames is None else frames:
         frame = np.asarray(vertices[rows[i]], np.float64)
-        name = f"{path}: {take.name}: frame {i} (row {rows[i]})"
+        name = f"{path}: {recording.name}: frame {i} (row {rows[i]})"
         bad = np.flatnonzero(~np.isfinite(frame).all(axis=1))
         if len(bad):
             raise SourceError(f"{name}: vertex {bad[0]} is not finite: {frame[bad[0]].tolist()}")
         yield name, meshes.Mesh(frame, None)
 
 
-def _rest(path: Path, still: tuple[np.ndarray, ...], subject: int) -> Iterator[Frame]:
-    yield f"{path}: person {subject}", meshes.Mesh(still[subject], None)
+def _neutral_frames(path: Path, neutral: tuple[np.ndarray, ...], subject: int) -> Iterator[Frame]:
+    yield f"{path}: person {subject}", meshes.Mesh(neutral[subject], None)

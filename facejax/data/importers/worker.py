@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from facejax.data.importers import apex_detection, base
 from facejax.data.importers.base import SourceError
+from facejax.geometry import host
 from facejax.io import atomic
 from facejax.landmarks import schemes
 
@@ -152,9 +152,8 @@ def to_millimetres(vertices: np.ndarray, scale: float) -> np.ndarray:
 
 def _held(vertices: np.ndarray, rest: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Vertices (N, 3) turned and moved so that those at `at` lie as near as can be to where they rest."""
-    here, there = vertices[at].mean(axis=0), rest[at].mean(axis=0)
-    turn, _ = Rotation.align_vectors(rest[at] - there, vertices[at] - here)
-    return (turn.apply(vertices - here) + there).astype(np.float32)
+    rotation, from_, to = host.procrustes(vertices[at], rest[at])
+    return ((vertices - from_) @ rotation.T + to).astype(np.float32)
 
 
 def _path(job: Job, number: int) -> Path:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax.data.synthetic import assets, makehuman
+from facejax.geometry.interpolation import smoothstep
 from facejax.mesh import graph
 
 LID_THICKNESS = 1.0
@@ -120,8 +121,7 @@ def template_regions() -> Regions:
     kernel = np.exp(-0.5 * (distance / 2.5) ** 2)
     kernel /= np.maximum(kernel.sum(axis=1, keepdims=True), 1e-12)
     reach = graph.geodesic(shape.vertices, shape.faces, mouth)[near]
-    fade = np.clip(1 - reach / LIP_REACH, 0, 1)
-    fade = fade * fade * (3 - 2 * fade)
+    fade = smoothstep(1 - reach / LIP_REACH)
     teeth = np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, mouth) < TEETH_REACH)
     return Regions(lids, pairs, near, (sign * fade)[:, None].astype(np.float32) * kernel.astype(np.float32), teeth)
 

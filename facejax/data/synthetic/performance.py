@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from facejax.data.synthetic import rig
+from facejax.data.synthetic import expression_recipes, rig
 
 RATE = 60  # frames per second, performed
 STORED_RATE = 30  # frames per second, stored
@@ -39,12 +39,12 @@ def apex_weights(label: str, subject: int, *, seed: int = 1) -> np.ndarray:
     """How a subject performs an expression: unit weights (U,) at the apex. Neutral is zero."""
     names = rig.unit_names()
     weights = np.zeros(len(names))
-    if label == NEUTRAL:
+    if label == expression_recipes.NEUTRAL:
         return weights
-    if label not in RECIPES:
-        raise ValueError(f"unknown expression {label!r}; the expressions are {', '.join(LABELS)}")
-    recipe, person = RECIPES[label], _person(subject, seed)
-    rng = np.random.default_rng([seed, subject, 1 + EXPRESSIONS.index(label)])
+    if label not in expression_recipes.RECIPES:
+        raise ValueError(f"unknown expression {label!r}; the expressions are {', '.join(expression_recipes.LABELS)}")
+    recipe, person = expression_recipes.RECIPES[label], _person(subject, seed)
+    rng = np.random.default_rng([seed, subject, 1 + expression_recipes.EXPRESSIONS.index(label)])
     chosen = [recipe.units]
     draw = rng.random()
     if recipe.variants:
@@ -61,7 +61,7 @@ def apex_weights(label: str, subject: int, *, seed: int = 1) -> np.ndarray:
 
 def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Performance:
     """Neutral -> apex -> neutral."""
-    rng = np.random.default_rng([seed, subject, 1 + EXPRESSIONS.index(label), 1 + take])
+    rng = np.random.default_rng([seed, subject, 1 + expression_recipes.EXPRESSIONS.index(label), 1 + take])
     apex = apex_weights(label, subject, seed=seed) * np.exp(TAKE_SPREAD * rng.standard_normal(len(rig.unit_names())))
     rest_before, rise = rng.integers(4, 10), rng.integers(18, 40)
     hold, fall, rest_after = rng.integers(12, 36), rng.integers(20, 46), rng.integers(4, 10)
@@ -79,7 +79,7 @@ def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Perfor
 
 def perform_direct(start: str, end: str, subject: int, *, take: int = 0, seed: int = 1, frames: int = 30) -> np.ndarray:
     """A transition performed directly, apex to apex, not through neutral: unit weights (frames, U)."""
-    labels = [LABELS.index(start), LABELS.index(end)]
+    labels = [expression_recipes.LABELS.index(start), expression_recipes.LABELS.index(end)]
     rng = np.random.default_rng([seed, subject, 1000 + labels[0], 1000 + labels[1], take])
     first, second = apex_weights(start, subject, seed=seed), apex_weights(end, subject, seed=seed)
     length = float(rng.integers(24, 46))

@@ -17,8 +17,6 @@ import functools
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from facejax.data.synthetic import assets, contact, makehuman, skin
 from facejax.mesh import deformation_transfer
@@ -148,15 +146,10 @@ def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     """
     loaded = assets.load()
     n = loaded.skin
-    source, _ = deformation_transfer.gradient_operator(makehuman.template().vertices.astype(np.float64), loaded.faces)
-    target, areas = deformation_transfer.gradient_operator(neutral[:n], loaded.faces)
-    weight = sparse.diags(np.repeat(areas, 3))
-    offsets = np.moveaxis(units[:, :n], 1, 0).reshape(n, -1)
-    still = np.abs(offsets).max(axis=1) < 1e-6
-    anchor = sparse.diags(np.where(still, 1.0, ANCHOR) * areas.mean())
-    solved = splu((target.T @ weight @ target + anchor).tocsc()).solve(
-        target.T @ (weight @ (source @ offsets)) + anchor @ offsets
+    still = np.abs(units[:, :n]).max(axis=(0, 2)) < 1e-6
+    transfer = deformation_transfer.DeformationTransfer(
+        makehuman.template().vertices, neutral[:n], loaded.faces, np.where(still, 1.0, ANCHOR)
     )
     carried = units.copy()
-    carried[:, :n] = np.moveaxis(solved.reshape(n, len(units), 3), 0, 1)
+    carried[:, :n] = transfer(units[:, :n])
     return carried

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import sparse
 
 from facejax.data.synthetic import assets, makehuman
+from facejax.geometry.interpolation import smoothstep
 
 YOUNG, OLD = 20.0, 80.0
 SLACK = 0.03  # compression that skin takes up before it folds
@@ -96,7 +97,7 @@ def template_pattern() -> Pattern:
     """Furrows and flesh, placed by the template's landmarks."""
     shape = makehuman.template()
     v, mark = shape.vertices.astype(np.float64), shape.vertices[shape.landmarks].astype(np.float64)
-    front = _step(v[:, 2], -5, 15)
+    front = smoothstep(v[:, 2], -5, 15)
 
     def spot(centre, radius):
         return np.exp(-0.5 * (np.linalg.norm(v - centre, axis=1) / radius) ** 2) * front
@@ -106,7 +107,7 @@ def template_pattern() -> Pattern:
 
     y, x = v[:, 1], v[:, 0]
     brow = middle(19, 24)[1]
-    forehead = _step(y, brow + 2, brow + 14) * _step(-y, -brow - 62, -brow - 42) * _step(-np.abs(x), -56, -34) * front
+    forehead = smoothstep(y, brow + 2, brow + 14) * smoothstep(-y, -brow - 62, -brow - 42) * smoothstep(-np.abs(x), -56, -34) * front
     furrows = [
         Furrow(forehead, y, 21.0, (0.25, 1.0)),
         Furrow(spot(middle(21, 22) + [0, 3, 0], 9), x, 14.0, (0.3, 1.1)),
@@ -134,7 +135,7 @@ def _nasolabial(v, start, end, side) -> tuple[np.ndarray, np.ndarray]:
     offset = v[:, :2] - start[:2]
     along = offset @ axis
     across = side * (offset @ np.array([-axis[1], axis[0]])) * np.sign(-axis[1])
-    mask = _step(along, -4, 6) * _step(-along, -length - 8, -length + 4) * np.exp(-0.5 * (across / 12.0) ** 2)
+    mask = smoothstep(along, -4, 6) * smoothstep(-along, -length - 8, -length + 4) * np.exp(-0.5 * (across / 12.0) ** 2)
     return across, mask
 
 
@@ -185,8 +186,3 @@ def _average(matrix: sparse.csr_matrix, values: np.ndarray) -> np.ndarray:
 def _areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[:, faces[:, i]] for i in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-
-
-def _step(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return t * t * (3 - 2 * t)

@@ -28,7 +28,7 @@ from facejax.mesh import deformation_transfer
 from facejax.models.decoders import linear
 
 COMPONENTS = 400
-SCALES = (10.0, 20.0, 40.0, 80.0)  # mm, of the smooth prior: wrinkles of a cheek, a cheek, a jaw, a head
+SMOOTH_SCALES_MM = (10.0, 20.0, 40.0, 80.0)  # mm, of the smooth prior: wrinkles of a cheek, a cheek, a jaw, a head
 NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # mm, of landmarks: a sixteenth from one to the next
 
 
@@ -100,10 +100,11 @@ def fit_statistics(
     )
 
 
-def transfer_to(person: Person, faces: np.ndarray, face: np.ndarray, hold: np.ndarray) -> np.ndarray:
+def transfer_to(person: Person, faces: np.ndarray, face: np.ndarray, regulariser: np.ndarray) -> np.ndarray:
     """A person's displacements on another face, (T, N, 3) float32."""
-    there = deformation_transfer.DeformationTransfer(person.neutral, face, faces, hold)
-    back = deformation_transfer.DeformationTransfer(face, person.neutral, faces, hold)
+    anchors = deformation_transfer.anchor_weights(regulariser)
+    there = deformation_transfer.DeformationTransfer(person.neutral, face, faces, anchors)
+    back = deformation_transfer.DeformationTransfer(face, person.neutral, faces, anchors)
     return deformation_transfer.invert(there, back, person.vertices).astype(np.float32)
 
 
@@ -130,7 +131,7 @@ def estimate_landmark_noise(params: GPMM, neutral: np.ndarray, landmarks: np.nda
         raise ValueError(f"landmarks: expected one or more frames of finite numbers, got {np.shape(landmarks)}")
     if isinstance(params.statistics, linear.LinearMap):
         raise ValueError("noise: this model was kept as one map, which cannot tell what faces do not do")
-    known = covariances(params, neutral, only=np.zeros(0, int))
+    known = covariances(params, neutral, vertex_index=np.zeros(0, int))
     here, _ = _posterior(known, params.prior)
     variance, directions = np.linalg.eigh(here)
     off = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
@@ -160,11 +161,11 @@ class Covariances(NamedTuple):
     smooth_cross: np.ndarray  # (3 L, 3 V)
 
 
-def covariances(params: GPMM, neutral: np.ndarray, *, only: np.ndarray | None = None) -> Covariances:
-    """Of one face (N, 3): all vertices, or `only` (V,). Raises `ValueError` for a face of another shape."""
+def covariances(params: GPMM, neutral: np.ndarray, *, vertex_index: np.ndarray | None = None) -> Covariances:
+    """Of one face (N, 3): all vertices, or `vertex_index` (V,). Raises `ValueError` for a face of another shape."""
     _check(params, neutral)
     at = params.landmark_index
-    keep = np.arange(len(params.face)) if only is None else only
+    keep = np.arange(len(params.face)) if vertex_index is None else vertex_index
     mean, within, cross = _learnt(params, neutral, keep)
     smooth = _smooth(params)
     spread = [np.kron(smooth[:, some], np.eye(3)) for some in (at, keep)]
@@ -195,7 +196,8 @@ def _learnt(params: GPMM, neutral: np.ndarray, keep: np.ndarray):
     if isinstance(known, linear.Moments):
         cross = known.cross.reshape(len(known.cross), -1, 3)[:, keep].reshape(len(known.cross), -1)
         return known.vertex_mean, known.covariance, cross
-    carrier = deformation_transfer.DeformationTransfer(params.face, neutral, params.faces, params.hold)
+    anchors = deformation_transfer.anchor_weights(params.hold)
+    carrier = deformation_transfer.DeformationTransfer(params.face, neutral, params.faces, anchors)
     shape = (len(known.components), *params.face.shape)
     moved = carrier(np.concatenate([known.vertex_mean[None], known.components.reshape(shape)]))
     mean, moved = moved[0], moved[1:]
@@ -208,5 +210,5 @@ def _smooth(params: GPMM) -> np.ndarray:
     """The smooth prior's covariance of landmarks and vertices, (L, N), for a standard deviation of one motion."""
     at = params.landmark_index
     squared = np.sum((params.face[at, None] - params.face) ** 2, axis=-1)
-    alike = sum(np.exp(-squared / (2 * scale**2)) for scale in SCALES) / len(SCALES)
+    alike = sum(np.exp(-squared / (2 * scale**2)) for scale in SMOOTH_SCALES_MM) / len(SMOOTH_SCALES_MM)
     return alike * params.motion[at, None] * params.motion

@@ -23,9 +23,9 @@ from facejax.mesh.hierarchy import Hierarchy
 from facejax.models.decoders import gpmm, linear, residual
 
 BATCH = 16
-FACES = 8  # remembered
+CACHE_SIZE = 8  # remembered
 # What was asked for last: the model and its map of a face, by the model's identity, the face's bytes and the noise.
-_prepared: OrderedDict[tuple[int, str, float], tuple[gpmm.GPMM, linear.LinearMap]] = OrderedDict()
+_cache: OrderedDict[tuple[int, str, float], tuple[gpmm.GPMM, linear.LinearMap]] = OrderedDict()
 
 
 class GPMMResidual(NamedTuple):
@@ -76,13 +76,13 @@ def apply(
 def cached_linear_map(base: gpmm.GPMM, neutral: np.ndarray, noise: float = 0.0) -> linear.LinearMap:
     """`gpmm.linear_map` of a model that is `gpmm.with_landmark_noise` of landmark noise in mm, remembered."""
     key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest(), noise
-    if key not in _prepared:
+    if key not in _cache:
         # The model is kept with its answer: no other can then have its identity.
-        _prepared[key] = base, gpmm.linear_map(gpmm.with_landmark_noise(base, noise), neutral)
-        while len(_prepared) > FACES:
-            _prepared.popitem(last=False)
-    _prepared.move_to_end(key)
-    return _prepared[key][1]
+        _cache[key] = base, gpmm.linear_map(gpmm.with_landmark_noise(base, noise), neutral)
+        while len(_cache) > CACHE_SIZE:
+            _cache.popitem(last=False)
+    _cache.move_to_end(key)
+    return _cache[key][1]
 
 
 def refine(params: GPMMResidual, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:

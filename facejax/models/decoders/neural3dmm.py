@@ -1,9 +1,9 @@
-"""Neural3DMM, as Otberdout et al. 2023, 4.2 modify it: a spiral autoencoder that is told where the landmarks went.
+"""Neural3DMM as modified by Otberdout et al. 2023, 4.2: a spiral autoencoder conditioned on landmark displacements.
 
-The neutral face is encoded by spiral convolutions, each followed by going down a level of the hierarchy, to 16
-numbers (Bouritsas et al. 2019); with the landmarks' displacements beside them, S2D-Dec's own climb decodes the
-*positions* of the expressive face. A baseline: it has to reconstruct the person as well, and is poor at people it has
-not seen.
+The neutral face is encoded to 16 numbers by spiral convolutions, each followed by downsampling to the next level of the
+hierarchy (Bouritsas et al. 2019). They are concatenated with the landmark displacements, and S2D-Dec's levels decode
+the *positions* of the expressive face. A baseline: it has to reconstruct the identity as well, and generalises poorly
+to unseen people.
 
 N vertices, L landmarks, B samples; millimetres.
 """
@@ -16,10 +16,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from facejax.mesh import spiral_conv, stencils
+from facejax.mesh import stencils
 from facejax.mesh.hierarchy import Hierarchy
 from facejax.mesh.stencils import Stencil
+from facejax.models import layers
 from facejax.models.decoders import s2d_dec
 
 ENCODER = (16, 32, 64, 128)
@@ -27,24 +29,24 @@ LATENT = 16
 
 
 class Scale(NamedTuple):
-    """Measured on the training set, in mm; never trained."""
+    """Normalisation measured on the training set, in mm; constant during training."""
 
-    face: jax.Array  # (N, 3) mean of the neutral faces
-    face_std: jax.Array  # () of neutral faces about it
-    landmark_mean: jax.Array  # (L, 3)
-    landmark_std: jax.Array  # ()
+    face: Array  # (N, 3) mean of the neutral faces
+    face_std: Array  # () standard deviation of the neutral faces about it
+    landmark_mean: Array  # (L, 3)
+    landmark_std: Array  # ()
 
 
 class Neural3DMM(NamedTuple):
-    """The constants, and the weights that are trained."""
+    """Parameters of Neural3DMM: the normalisation and the trained weights."""
 
     scale: Scale
     weights: dict[str, Any]
 
 
 def downsampling_spirals(hierarchy: Hierarchy) -> tuple[Stencil, ...]:
-    """The spirals of those vertices alone that the next level keeps, level by level from fine to coarse."""
-    found = []
+    """Return stencils that convolve and downsample, from fine to coarse: spirals of the vertices kept by the next level."""
+    found: list[Stencil] = []
     for level, spirals in enumerate(hierarchy.spirals):
         within = np.searchsorted(np.sort(hierarchy.kept[level]), hierarchy.kept[level + 1])
         within = np.argsort(hierarchy.kept[level])[within]
@@ -54,7 +56,25 @@ def downsampling_spirals(hierarchy: Hierarchy) -> tuple[Stencil, ...]:
 
 
 def init(
-    key: jax.Array,
+    key: Array,
+    hierarchy: Hierarchy,
+    scale: Scale,
+    *,
+    encoder: Sequence[int] = ENCODER,
+    channels: Sequence[int] = s2d_dec.CHANNELS,
+) -> Neural3DMM:
+    """Return random parameters.
+
+    Args:
+      encoder: channels from fine to coarse.
+      channels: of the decoder, as in `s2d_dec.init`.
+
+    Raises:
+      ValueError: `encoder` or `channels` does not match the number of levels.
+    """
+    INIT_BODY
+def init(
+    key: Array,
     hierarchy: Hierarchy,
     scale: Scale,
     *,
@@ -80,8 +100,8 @@ def init(
 
 @jax.jit
 def apply(
-    params: Neural3DMM, hierarchy: Hierarchy, down: tuple[Stencil, ...], displacements: jax.Array, neutral: jax.Array
-) -> jax.Array:
+    params: Neural3DMM, hierarchy: Hierarchy, down: tuple[Stencil, ...], displacements: Array, neutral: Array
+) -> Array:
     """Positions (B, N, 3) of the vertices from landmark displacements (B, L, 3) and neutral faces (B, N, 3).
 
     `down` are `descents(hierarchy)`.
@@ -100,7 +120,7 @@ def apply(
 
 
 @jax.jit
-def encode(params: Neural3DMM, down: tuple[Stencil, ...], neutral: jax.Array) -> jax.Array:
+def encode(params: Neural3DMM, down: tuple[Stencil, ...], neutral: Array) -> Array:
     """The latent code (B, 16) of neutral faces (B, N, 3)."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = ((neutral - scale.face) / scale.face_std).transpose(1, 0, 2)

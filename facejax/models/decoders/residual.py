@@ -1,15 +1,14 @@
-"""A spiral decoder for what the best linear answer leaves over.
+"""Residual decoder: a spiral network that corrects a linear estimate of the vertex displacements.
 
     displacement = base + gate * unit * network(landmarks, base, neutral)
 
-`base` is the displacement of every vertex that a linear map gives (`facejax.models.gpmm`, or ridge regression). At
-the finest level the network sees, at each vertex, that displacement, the local strain that it makes, the neutral
-position and normal, a few numbers of the vertex's own, and the signal that S2D-Dec's climb (Otberdout et al. 2023,
-3.3) makes from the landmarks; two spiral convolutions mix them, and every vertex reads its three numbers out in its
-own way. It starts at zero, so that training starts at the base. The gate is not trained: it is chosen on held-out
-faces, and may be 0.
+`base` is the linear estimate (`facejax.models.decoders.gpmm`, or ridge regression). At the finest level the input of
+the network at each vertex is that displacement, the local strain that it causes, the neutral position and normal, a
+learned embedding of the vertex, and the signal that the levels of S2D-Dec (Otberdout et al. 2023, 3.3) decode from the
+landmarks. Two spiral convolutions follow, then a linear readout per vertex. The readout is initialised to zero, so that
+training starts at the base. The gate is not trained: it is chosen on held-out faces, and may be 0.
 
-N vertices, L landmarks, B samples, C channels; millimetres.
+N vertices, L landmarks, B samples; millimetres.
 """
 
 from __future__ import annotations
@@ -19,55 +18,68 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from facejax.mesh import spiral_conv, strain
+from facejax.mesh import strain
 from facejax.mesh.hierarchy import Hierarchy
+from facejax.models import layers
 from facejax.models.decoders import s2d_dec
 
 CHANNELS = (64, 32, 16, 16, 16)
-MIXED, OWN = 16, 8
-STRAIN, MOVED, PLACE = 0.1, 2.0, 10.0  # what counts as one: a tenth longer, 2 mm moved, 10 mm off the mean face
-LOCAL = 15  # strain 6, displacement, normal and place 3 each
-# Each vertex sees few gradients for its own readout; with Adam's equal steps the factor makes it learn faster.
+WIDTH, EMBEDDING = 16, 8  # channels of the two convolutions, and numbers learned per vertex
+STRAIN, DISPLACEMENT_MM, POSITION_MM = 0.1, 2.0, 10.0  # units that the inputs are divided by
+LOCAL = 15  # inputs per vertex: strain 6; displacement, normal and position 3 each
+# A vertex's own readout receives few gradients; Adam's steps are of one size, so this factor raises its learning rate.
 READOUT = 10.0
 
 
 class Scale(NamedTuple):
-    """Measured on the training set, in mm; never trained."""
+    """Normalisation measured on the training set, in mm; constant during training."""
 
-    face: jax.Array  # (N, 3) the mean neutral face
-    landmark_mean: jax.Array  # (L, 3)
-    landmark_std: jax.Array  # ()
-    unit: jax.Array  # () root mean square of what the base leaves over, per coordinate
+    face: Array  # (N, 3) the mean neutral face
+    landmark_mean: Array  # (L, 3)
+    landmark_std: Array  # ()
+    unit: Array  # () root mean square of the base's residual, per coordinate
 
 
 class ResidualDecoder(NamedTuple):
-    """The constants, the weights that are trained, and how much of the network's answer to take."""
+    """Parameters: the normalisation, the trained weights, and the share of the network's output that is added."""
 
     scale: Scale
     weights: dict[str, Any]
-    gate: jax.Array  # ()
+    gate: Array  # ()
 
 
 def init(
-    key: jax.Array, hierarchy: Hierarchy, scale: Scale, *, channels: Sequence[int] = CHANNELS, mixed: int = MIXED
+    key: Array, hierarchy: Hierarchy, scale: Scale, *, channels: Sequence[int] = CHANNELS, width: int = WIDTH
 ) -> ResidualDecoder:
-    """Weights that answer zero."""
-    climb_key, own_key, *mix_keys = jax.random.split(key, 4)
+    """Return parameters whose network outputs zero.
+
+    Args:
+      channels: of the decoded levels, as in `s2d_dec.init`.
+      width: channels of the two convolutions at the finest level.
+
+    Raises:
+      ValueError: `channels` does not match the number of levels.
+    """
+    levels_key, embedding_key, *conv_keys = jax.random.split(key, 4)
     vertices, spiral = hierarchy.sizes[0], len(hierarchy.surface.source)
-    climb = s2d_dec.init_weights(climb_key, hierarchy, inputs=scale.landmark_mean.size, channels=channels, outputs=None)
-    he = jax.nn.initializers.he_normal(in_axis=(0, 1), out_axis=2)
-    widths = (LOCAL + OWN + channels[-1], mixed, mixed)
-    mix = [
-        {"kernel": he(k, (spiral, inward, outward)), "bias": jnp.zeros(outward)}
-        for k, inward, outward in zip(mix_keys, widths[:-1], widths[1:], strict=True)
+    levels = s2d_dec.init_weights(
+        levels_key, hierarchy, inputs=scale.landmark_mean.size, channels=channels, outputs=None
+    )
+    widths = (LOCAL + EMBEDDING + channels[-1], width, width)
+    convs = [
+        layers.init_spiral_conv(conv_key, spiral, width_in, width_out)
+        for conv_key, width_in, width_out in zip(conv_keys, widths[:-1], widths[1:], strict=True)
     ]
+    # The keys are names of leaves in model files.
     weights = {
-        "climb": climb,
-        "own": 0.1 * jax.random.normal(own_key, (vertices, OWN)),
-        "mix": mix,
-        "readout": jnp.zeros((vertices, mixed, 3)),
-        "shared": jnp.zeros((mixed, 3)),
+        "climb": levels,
+        "own": 0.1 * jax.random.normal(embedding_key, (vertices, EMBEDDING)),
+        "mix": convs,
+        "readout": jnp.zeros((vertices, width, 3)),
+        "shared": jnp.zeros((width, 3)),
     }
     return ResidualDecoder(scale, weights, jnp.ones(()))
 
@@ -77,32 +89,38 @@ def apply(
     params: ResidualDecoder,
     hierarchy: Hierarchy,
     tables: strain.VertexTriangles,
-    displacements: jax.Array,
-    base: jax.Array,
-    neutral: jax.Array,
-) -> jax.Array:
-    """Vertex displacements (B, N, 3) from landmark displacements (B, L, 3), a base (B, N, 3) and neutral faces.
+    displacements: Float[Array | np.ndarray, "B L 3"],
+    base: Float[Array | np.ndarray, "B N 3"],
+    neutral: Float[Array | np.ndarray, "*B N 3"],
+) -> Float[Array, "B N 3"]:
+    """Return refined vertex displacements from landmark displacements and a linear estimate `base`.
 
-    Neutral faces are (N, 3), or (B, N, 3) one for each sample. Give batches of 16 or so: all are worked on at once.
+    `neutral` is one face (N, 3), or one per sample (B, N, 3). Pass batches of about 16: all samples are held in memory
+    at once.
+
+    Raises:
+      ValueError: wrong shapes.
     """
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     _check(scale, displacements, base, neutral)
     rest = jnp.swapaxes(jnp.broadcast_to(neutral, base.shape), 0, 1)
-    moved = jnp.swapaxes(base, 0, 1)
+    moved = jnp.swapaxes(jnp.asarray(base), 0, 1)
     stretch, normal = strain.strain(moved, rest, tables)
-    place = (rest - scale.face[:, None]) / PLACE
-    own = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], OWN))
+    position = (rest - scale.face[:, None]) / POSITION_MM
+    embedding = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], EMBEDDING))
     x = (displacements - scale.landmark_mean).reshape(len(base), -1) / scale.landmark_std
-    climbed = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
-    x = jnp.concatenate([stretch / STRAIN, moved / MOVED, normal, place, own, climbed], axis=-1)
+    decoded = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
+    x = jnp.concatenate([stretch / STRAIN, moved / DISPLACEMENT_MM, normal, position, embedding, decoded], axis=-1)
     first, second = weights["mix"]
-    x = jax.nn.elu(spiral_conv.spiral_conv(x, first["kernel"], hierarchy.surface) + first["bias"])
-    x = x + jax.nn.elu(spiral_conv.spiral_conv(x, second["kernel"], hierarchy.surface) + second["bias"])
-    found = READOUT * jnp.einsum("nbc,nco->nbo", x, weights["readout"]) + x @ weights["shared"]
-    return base + params.gate * scale.unit * jnp.swapaxes(found, 0, 1)
+    x = jax.nn.elu(layers.spiral_conv(first, x, hierarchy.surface))
+    x = x + jax.nn.elu(layers.spiral_conv(second, x, hierarchy.surface))
+    residual = READOUT * jnp.einsum("nbc,nco->nbo", x, weights["readout"]) + x @ weights["shared"]
+    return base + params.gate * scale.unit * jnp.swapaxes(residual, 0, 1)
 
 
-def _check(scale: Scale, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> None:
+def _check(
+    scale: Scale, displacements: Array | np.ndarray, base: Array | np.ndarray, neutral: Array | np.ndarray
+) -> None:
     marks, vertices = scale.landmark_mean.shape, scale.face.shape
     if displacements.ndim != 3 or displacements.shape[1:] != marks:
         raise ValueError(f"displacements: expected (B, {marks[0]}, 3), got {displacements.shape}")

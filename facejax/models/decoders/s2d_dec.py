@@ -1,57 +1,62 @@
-"""S2D-Dec: from sparse landmark displacements to the displacement of every vertex.
+"""S2D-Dec: a spiral decoder from sparse landmark displacements to dense vertex displacements.
 
-After Otberdout et al. 2023, 3.3. A dense layer makes a signal on the coarsest level of a hierarchy; at
-each level the signal is upsampled, convolved along spirals and passed through ELU; a last spiral
-convolution gives three numbers per vertex. L landmarks, N vertices, millimetres. The output is a
-displacement: the caller adds the neutral mesh.
+After Otberdout et al. 2023, 3.3. A dense layer computes a signal on the coarsest level of a mesh hierarchy; at each
+level the signal is upsampled, convolved along spirals and passed through ELU; a last spiral convolution outputs three
+numbers per vertex. The output is a displacement: the caller adds the neutral mesh.
+
+L landmarks, N vertices, B samples; millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from facejax.mesh import spiral_conv
 from facejax.mesh.hierarchy import Hierarchy
+from facejax.models import layers
+from facejax.models.layers import Weights
 
-Weights = dict[str, Any]
 CHANNELS = (128, 64, 32, 32, 16)
 
 
 class Scale(NamedTuple):
-    """Normalisation measured on the training set, in mm; never trained."""
+    """Normalisation measured on the training set, in mm; constant during training."""
 
-    landmark_mean: jax.Array  # (L, 3)
-    landmark_std: jax.Array  # ()
-    vertex_mean: jax.Array  # (N, 3)
-    vertex_std: jax.Array  # ()
+    landmark_mean: Array  # (L, 3)
+    landmark_std: Array  # ()
+    vertex_mean: Array  # (N, 3)
+    vertex_std: Array  # ()
 
 
 class S2DDec(NamedTuple):
-    """The constants, and the weights that are trained."""
+    """Parameters of S2D-Dec: the normalisation and the trained weights."""
 
     scale: Scale
     weights: Weights
 
 
 def init(
-    key: jax.Array,
+    key: Array,
     hierarchy: Hierarchy,
     *,
     landmarks: int = 68,
     channels: Sequence[int] = CHANNELS,
     scale: Scale | None = None,
 ) -> S2DDec:
-    """Random weights that start within a hundredth of the mean displacement.
+    """Return random parameters whose initial output is close to the mean displacement.
 
-    `channels` from the coarsest level's signal to the finest: one more than the hierarchy has
-    upsamplings. Without `scale`, displacements are taken as they are. Raises `ValueError` where the
-    numbers of levels do not fit.
+    Args:
+      channels: from the coarsest level's signal to the finest, one more than the hierarchy has upsamplings.
+      scale: normalisation; without it displacements are used as they are.
+
+    Raises:
+      ValueError: `channels` does not match the number of levels.
     """
     weights = init_weights(key, hierarchy, inputs=3 * landmarks, channels=channels, outputs=3)
     weights["convs"][-1]["kernel"] *= 0.01
@@ -61,77 +66,82 @@ def init(
 
 
 def init_weights(
-    key: jax.Array, hierarchy: Hierarchy, *, inputs: int, channels: Sequence[int], outputs: int | None
+    key: Array, hierarchy: Hierarchy, *, inputs: int, channels: Sequence[int], outputs: int | None
 ) -> Weights:
-    """Random weights of `decode`, from `inputs` numbers to `outputs` per vertex; without outputs, of `decode_levels`.
+    """Return random weights of `decode`, from `inputs` numbers to `outputs` per vertex.
 
-    `channels` as in `init`. Raises `ValueError` where the numbers of levels do not fit.
+    Without `outputs` the last convolution is left out: weights of `decode_levels`. `channels` and errors as in `init`.
     """
-    climbs = hierarchy.climbs[::-1]
-    if len(channels) != len(climbs) + 1:
-        raise ValueError(f"channels: expected {len(climbs) + 1} for this hierarchy, got {len(channels)}")
+    upsamplings = hierarchy.climbs[::-1]
+    if len(channels) != len(upsamplings) + 1:
+        raise ValueError(f"channels: expected {len(upsamplings) + 1} for this hierarchy, got {len(channels)}")
     dense_key, *conv_keys = jax.random.split(key, len(channels) + 1)
-    he = jax.nn.initializers.he_normal(in_axis=(0, 1), out_axis=2)
     convs = [
-        {"kernel": he(k, (len(stencil.source), inward, outward)), "bias": jnp.zeros(outward)}
-        for k, stencil, inward, outward in zip(
-            conv_keys, (*climbs, hierarchy.surface), channels, (*channels[1:], outputs), strict=True
+        layers.init_spiral_conv(conv_key, len(stencil.source), width_in, width_out)
+        for conv_key, stencil, width_in, width_out in zip(
+            conv_keys, (*upsamplings, hierarchy.surface), channels, (*channels[1:], outputs), strict=True
         )
-        if outward is not None
+        if width_out is not None
     ]
-    coarse = hierarchy.sizes[-1] * channels[0]
     glorot = jax.nn.initializers.glorot_normal()
-    return {"dense": {"kernel": glorot(dense_key, (inputs, coarse)), "bias": jnp.zeros(coarse)}, "convs": convs}
+    dense = layers.init_dense(dense_key, inputs, hierarchy.sizes[-1] * channels[0], initializer=glorot)
+    return {"dense": dense, "convs": convs}
 
 
-def decode(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
-    """A batch of vectors (B, inputs) -> a signal on the finest level (N, B, outputs), the batch inside."""
-    last = weights["convs"][-1]
-    return (
-        spiral_conv.spiral_conv(decode_levels(weights, hierarchy, x), last["kernel"], hierarchy.surface) + last["bias"]
-    )
+def decode(weights: Weights, hierarchy: Hierarchy, x: Float[Array, "B inputs"]) -> Float[Array, "N B outputs"]:
+    """Decode a batch of vectors to a signal on the finest level."""
+    return layers.spiral_conv(weights["convs"][-1], decode_levels(weights, hierarchy, x), hierarchy.surface)
 
 
-def decode_levels(weights: Weights, hierarchy: Hierarchy, x: jax.Array) -> jax.Array:
-    """`decode` but for its last convolution: (B, inputs) -> (N, B, channels[-1])."""
-    x = x @ weights["dense"]["kernel"] + weights["dense"]["bias"]
-    climbs = hierarchy.climbs[::-1]
-    convs = weights["convs"][: len(climbs)]
-    # The batch inside, as `ops` wants it.
+def decode_levels(weights: Weights, hierarchy: Hierarchy, x: Float[Array, "B inputs"]) -> Float[Array, "N B C"]:
+    """Decode a batch of vectors up to the finest level, without the last convolution; C is `channels[-1]`."""
+    upsamplings = hierarchy.climbs[::-1]
+    convs = weights["convs"][: len(upsamplings)]
+    # The batch axis comes second, as `spiral_conv` expects.
+    x = layers.dense(weights["dense"], x)
     x = x.reshape(len(x), hierarchy.sizes[-1], convs[0]["kernel"].shape[1]).transpose(1, 0, 2)
-    for conv, stencil in zip(convs, climbs, strict=True):
-        x = jax.nn.elu(spiral_conv.spiral_conv(x, conv["kernel"], stencil) + conv["bias"])
+    for conv, stencil in zip(convs, upsamplings, strict=True):
+        x = jax.nn.elu(layers.spiral_conv(conv, x, stencil))
     return x
 
 
 @partial(jax.jit, static_argnames="chunk")
-def apply(params: S2DDec, hierarchy: Hierarchy, displacements: jax.Array, *, chunk: int | None = None) -> jax.Array:
-    """Vertex displacements (..., N, 3) in mm from landmark displacements (..., L, 3) in mm.
+def apply(
+    params: S2DDec, hierarchy: Hierarchy, displacements: Float[Array | np.ndarray, "... L 3"], *, chunk: int | None = None
+) -> Float[Array, "... N 3"]:
+    """Return vertex displacements in mm from landmark displacements in mm.
 
-    Give whole batches: leading axes are free, and a batch is much faster than a vmap of single samples.
-    It is worked on `chunk` samples at a time, by default as suits the processor. Move the hierarchy to
-    the device once (`jax.device_put`). Raises `ValueError` for a wrong number of landmarks.
+    Pass whole batches: a batch is much faster than a vmap over single samples. `chunk` samples are decoded at a time,
+    by default a number that suits the backend. Move the hierarchy to the device once (`jax.device_put`).
+
+    Raises:
+      ValueError: wrong number of landmarks.
     """
     expected = params.scale.landmark_mean.shape
     if displacements.shape[-2:] != expected:
         raise ValueError(f"displacements: expected (..., {expected[0]}, 3), got {displacements.shape}")
     lead = displacements.shape[:-2]
-    flat = displacements.reshape(-1, 3 * expected[0])
+    flat = jnp.asarray(displacements).reshape(-1, 3 * expected[0])
     out = _in_chunks(partial(_decode, params, hierarchy), flat, chunk or _chunk(hierarchy))
     return out.reshape(*lead, *out.shape[1:])
 
 
 def measure(batches: Iterable[tuple[np.ndarray, np.ndarray]]) -> Scale:
-    """The scale of a training set that comes as batches of landmarks (B, L, 3) and vertices (B, N, 3), in mm.
+    """Measure the normalisation of a training set given as batches of landmarks (B, L, 3) and vertices (B, N, 3) in mm.
 
-    Means per point, one standard deviation over all coordinates about them. Sums are kept in float64.
+    Returns a mean per point and one standard deviation over all coordinates. Sums are accumulated in float64.
+
+    Raises:
+      ValueError: no batch.
     """
-    count, sums, squares = 0, [0.0, 0.0], [0.0, 0.0]
+    count = 0
+    sums: list[np.ndarray] = [np.zeros(()), np.zeros(())]
+    squares = [0.0, 0.0]
     for pair in batches:
         count += len(pair[0])
         for i, values in enumerate(pair):
             sums[i] = sums[i] + np.sum(values, axis=0, dtype=np.float64)
-            squares[i] += np.sum(np.square(values, dtype=np.float64))
+            squares[i] += float(np.sum(np.square(values, dtype=np.float64)))
     if count == 0:
         raise ValueError("expected at least one batch, got none")
     means = [total / count for total in sums]
@@ -143,8 +153,8 @@ def measure(batches: Iterable[tuple[np.ndarray, np.ndarray]]) -> Scale:
     return Scale(*(jnp.asarray(leaf, jnp.float32) for leaf in leaves))
 
 
-def _decode(params: S2DDec, hierarchy: Hierarchy, displacements: jax.Array) -> jax.Array:
-    """A chunk (B, 3 L) -> (B, N, 3)."""
+def _decode(params: S2DDec, hierarchy: Hierarchy, displacements: Array) -> Array:
+    """Decode a chunk (B, 3 L) to (B, N, 3)."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = (displacements - scale.landmark_mean.reshape(-1)) / scale.landmark_std
     x = decode(weights, hierarchy, x)
@@ -152,17 +162,17 @@ def _decode(params: S2DDec, hierarchy: Hierarchy, displacements: jax.Array) -> j
 
 
 def _chunk(hierarchy: Hierarchy) -> int:
-    """How many samples to work on at once.
+    """Return the number of samples to decode at once.
 
-    On a CPU, what is gathered from should stay in the cache, and temporary arrays of more than 32 MB are given back to
-    the system by glibc's allocator after every call. Sixteen samples of 5,000 vertices were the fastest: 64 of them
-    took 34 ms so, 42 by thirty-twos, 42 by fours.
+    On a CPU, the signals that are gathered from should stay in the cache, and glibc's allocator returns temporary
+    arrays of more than 32 MB to the system after every call. Chunks of 16 samples were the fastest at 5,000 vertices:
+    64 samples took 34 ms, against 42 ms in chunks of 32 or of 4.
     """
     return max(1, 82_000 // hierarchy.sizes[0]) if jax.default_backend() == "cpu" else 1024
 
 
-def _in_chunks(function, x: jax.Array, chunk: int) -> jax.Array:
-    """function(x) in equal pieces of at most `chunk` rows, one after another."""
+def _in_chunks(function: Callable[[Array], Array], x: Array, chunk: int) -> Array:
+    """Apply a function to equal pieces of at most `chunk` rows, one after another."""
     pieces = -(-len(x) // chunk)
     if pieces <= 1:
         return function(x)

@@ -80,7 +80,7 @@ def velocity(params: FlowMatching, state: State, time: jax.Array, start, end, po
     """The field at a state and a time (): a tangent vector at y (1, 1, R + 1), and the rate of s (2,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     y, s = state
-    scale = unit(chart, start, end)
+    scale = state_std(chart, start, end)
     context = jnp.concatenate([_waves(time), weights["labels"][0, start], weights["labels"][1, end], pose])
     centre = to_state(chart, tangent_pca.conditional_mean(chart, start, end, pose))[0]
     offset = (y - centre)[0, 0] / scale
@@ -152,7 +152,7 @@ def _pole(chart: TangentPCA) -> jax.Array:
 
 
 @jax.jit
-def unit(chart: TangentPCA, start, end) -> jax.Array:
+def state_std(chart: TangentPCA, start, end) -> jax.Array:
     """A length for each entry of y (R + 1,): the pair's deviations; their mean along p."""
     scale = chart.scale[start, end] / jnp.sqrt(len(chart.p))
     return jnp.append(jnp.sqrt(jnp.mean(scale**2)), scale)

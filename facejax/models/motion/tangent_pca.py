@@ -20,7 +20,7 @@ import numpy as np
 
 from facejax.geometry import sphere
 
-FEW = 8  # motions of a pair below which its own spread is not trusted
+MIN_PAIR_MOTIONS = 8  # motions of a pair below which its own spread is not trusted
 RIDGE = 0.01  # of the regression on poses, in units of their unit variance per motion
 SCALARS = 2  # log-length, log-seconds
 
@@ -55,13 +55,13 @@ def fit(
     motion: Motion,
     start: np.ndarray,
     end: np.ndarray,
-    here: np.ndarray,
+    first: np.ndarray,
     *,
     labels: int,
     rank: int = 128,
     pose: int = 32,
 ) -> TangentPCA:
-    """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), first frames `here` (M, L, 3).
+    """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), first frames `first` (M, L, 3).
 
     Of `decode` the log-length and log-seconds (M,) are read; `start`, `end` are labels (M,) in 0..labels-1.
     The directions span the R principal ones of all tangent vectors, and are turned within that span so that
@@ -85,8 +85,8 @@ def fit(
     within = components - mean[start, end]
     turn = np.linalg.eigh(within.T @ within / len(within))[1][:, ::-1]
 
-    pose_mean, pose_basis, pose_scale = _poses(np.asarray(here, np.float64), start, labels, pose)
-    poses = (here - pose_mean[start]).reshape(len(here), -1) @ pose_basis.T / pose_scale
+    pose_mean, pose_basis, pose_scale = _poses(np.asarray(first, np.float64), start, labels, pose)
+    poses = (first - pose_mean[start]).reshape(len(first), -1) @ pose_basis.T / pose_scale
     scalars = np.stack([motion.log_length, motion.log_seconds], axis=1).astype(np.float64)
     scalar_mean = _pair_means(scalars, start, end, labels)
     scalar_std = np.maximum(np.std(scalars - scalar_mean[start, end], axis=0), 1e-6)
@@ -117,9 +117,9 @@ def decode(chart: TangentPCA, values: jax.Array, start, end) -> tuple[jax.Array,
 
 
 @jax.jit
-def encode_pose(chart: TangentPCA, here: jax.Array, start) -> jax.Array:
+def encode_pose(chart: TangentPCA, displacement: jax.Array, start) -> jax.Array:
     """The pose (D,) of a displacement from neutral (L, 3) at which a motion of the label `start` starts."""
-    inside = jnp.tensordot(chart.pose_basis, here - chart.pose_mean[start], 2) / chart.pose_scale
+    inside = jnp.tensordot(chart.pose_basis, displacement - chart.pose_mean[start], 2) / chart.pose_scale
     return jnp.where(jnp.asarray(start) == 0, 0.0, inside)
 
 
@@ -189,7 +189,7 @@ def _pair_spreads(within: np.ndarray, pooled: np.ndarray, start, end, labels: in
     np.add.at(total, pair, within**2)
     # The mean was fitted too: one degree of freedom less.
     own = total / np.maximum(count - 1, 1)[:, None]
-    variance = np.where(count[:, None] >= FEW, np.maximum(own, 1e-6 * pooled), pooled)
+    variance = np.where(count[:, None] >= MIN_PAIR_MOTIONS, np.maximum(own, 1e-6 * pooled), pooled)
     return np.sqrt(variance).reshape(labels, labels, -1)
 
 

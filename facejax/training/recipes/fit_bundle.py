@@ -19,7 +19,7 @@ from facejax.mesh import rbf_weights
 from facejax.models import bundle
 from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual
 
-FEWEST = 4  # training subjects, so that one fold of each cross-validation holds somebody
+MIN_TRAIN_SUBJECTS = 4  # training subjects, so that one fold of each cross-validation holds somebody
 
 
 class Plans(NamedTuple):
@@ -70,8 +70,8 @@ def check(data: dataset.Dataset) -> None:
     people = data.subjects("train")
     if len(data.vertices) == 0:
         raise ValueError(f"{data.path}: holds landmarks alone, expected meshes; `facejax.fit_motion` fits their motion")
-    if len(people) < FEWEST:
-        raise ValueError(f"{data.path}: {len(people)} training subjects, expected {FEWEST} or more")
+    if len(people) < MIN_TRAIN_SUBJECTS:
+        raise ValueError(f"{data.path}: {len(people)} training subjects, expected {MIN_TRAIN_SUBJECTS} or more")
     named = {s.label for s in data.sequences if s.subject in set(people.tolist()) and ">" not in s.label}
     lacking = [label for label in data.labels[1:] if label not in named]
     if lacking or len(data.labels) < 3:

@@ -21,8 +21,8 @@ from facejax.models.decoders import gpmm, linear
 SMOOTHNESS_GRID = (0.0, 0.003, 0.01, 0.03, 0.06, 0.12, 0.25)
 NOISE_GRID = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 FOLDS = 4
-JUDGED = 12  # held-out people per fold, as many of their frames, and a quarter of the vertices: enough to choose by
-FRAMES = 24
+EVALUATED_PEOPLE = 12  # held-out people per fold, as many of their frames, and a quarter of the vertices: enough to choose by
+EVALUATED_FRAMES = 24
 MIN_RELATIVE_GAIN = 0.99  # a prior that is not plain has to be better by a hundredth
 
 
@@ -123,13 +123,13 @@ def _errors(params: gpmm.GPMM, train: MeshSubset, rows: np.ndarray) -> np.ndarra
     """Mean vertex distance in mm of some held-out people's frames, under each prior."""
     rng = np.random.default_rng(0)
     everybody = np.unique(train.owner[rows])
-    chosen = np.sort(rng.permutation(everybody)[:JUDGED])
+    chosen = np.sort(rng.permutation(everybody)[:EVALUATED_PEOPLE])
     only = np.union1d(rng.permutation(len(params.face))[: len(params.face) // 4], params.landmark_index)
     total, count = 0.0, 0
     for subject in chosen:
         mine = rows[train.owner[rows] == subject]
-        landmarks, vertices = train.read(np.sort(rng.permutation(mine)[:FRAMES]))
-        known = gpmm.covariances(params, train.data.neutral[subject], only=only)
+        landmarks, vertices = train.read(np.sort(rng.permutation(mine)[:EVALUATED_FRAMES]))
+        known = gpmm.covariances(params, train.data.neutral[subject], vertex_index=only)
         off = [gpmm.predict(known, prior, landmarks) - vertices[:, only] for prior in _priors(params.prior.carried)]
         total = total + np.array([np.linalg.norm(one, axis=-1).mean(axis=-1).sum() for one in off])
         count += len(vertices)

@@ -68,7 +68,7 @@ def fit_gan(
     Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
     and another plan in it is refused. With a `mesh` each batch is shared out, see `training.run`.
     """
-    config = sized(config, chart)
+    config = config_for_chart(config, chart)
     _claim(folder, "gan", plan, config, seed, examples.values)
     generator_key, critic_key, play_key = jax.random.split(jax.random.key(seed), 3)
     players = steps.Players(
@@ -114,7 +114,7 @@ def fit_flow(
     Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
     exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
     """
-    config = sized(config, chart)
+    config = config_for_chart(config, chart)
     _claim(folder, "flow", plan, config, seed, examples.values)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     weights = flow_matching.init(init_key, chart, config=config).weights
@@ -125,7 +125,7 @@ def fit_flow(
         keys = jax.random.split(source_key, len(values))
         source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
         target = jax.vmap(flow_matching.to_state, (None, 0))(chart, values)
-        unit = jax.vmap(flow_matching.unit, (None, 0, 0))(chart, *condition[:2])
+        unit = jax.vmap(flow_matching.state_std, (None, 0, 0))(chart, *condition[:2])
         # Of one size in the mean, whatever the power: the two scalars keep their weight.
         size = jnp.sqrt(jnp.mean(unit ** (2 - 2 * plan.whitening), axis=1, keepdims=True))
         unit = size * unit**plan.whitening
@@ -226,7 +226,7 @@ def _run(step, state, examples: transitions.Examples, chart, folder, count: int,
     )
 
 
-def sized(config, chart: tangent_pca.TangentPCA):
+def config_for_chart(config, chart: tangent_pca.TangentPCA):
     """A network's config with the sizes that the chart knows."""
     (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
     return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)

@@ -52,7 +52,7 @@ def fit(
 ) -> FittedNeural3DMM:
     """Train on meshes; `mesh` as in `training.run`."""
     data = train.data
-    chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
+    chosen = hashlib.sha256(train.indices.tobytes()).hexdigest()
     metric_logger.claim_folder(
         folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
     )

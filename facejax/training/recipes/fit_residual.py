@@ -57,7 +57,7 @@ def fit(
     `mesh` as in `training.run`.
     """
     folder, data = Path(folder), train.data
-    chosen = hashlib.sha256(train.at.tobytes()).hexdigest()
+    chosen = hashlib.sha256(train.indices.tobytes()).hexdigest()
     base = base or fit_gpmm.fit(train, by=by)
     claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
     metric_logger.claim_folder(folder, claim | {"base": base.params.prior._asdict()})

@@ -51,7 +51,7 @@ def fit(
     `mesh` as in `training.run`.
     """
     data = meshes.data
-    chosen = hashlib.sha256(meshes.at.tobytes()).hexdigest()
+    chosen = hashlib.sha256(meshes.indices.tobytes()).hexdigest()
     metric_logger.claim_folder(
         folder, {"plan": plan._asdict(), "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
     )

@@ -22,7 +22,9 @@ def person(seed, *, frames=FRAMES, neutral=None, modes=MODES):
         neutral = MEAN @ (np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
     moved = np.einsum("fr,rnx->fnx", rng.normal(size=(frames, len(modes))), modes)
     if neutral is not MEAN:
-        moved = deformation_transfer.DeformationTransfer(MEAN, neutral, FACES, np.full(N, 2.0))(moved)
+        moved = deformation_transfer.DeformationTransfer(
+            MEAN, neutral, FACES, deformation_transfer.anchor_weights(np.full(N, 2.0))
+        )(moved)
     return gpmm.Person(neutral, moved[:, PICKED], moved)
 
 
@@ -71,7 +73,9 @@ def test_against_the_whole_gaussian(people, carried):
     params, new = fit(people, *prior, components=4), person(7)
     known = params.statistics
     if carried:
-        carrier = deformation_transfer.DeformationTransfer(params.face, new.neutral, FACES, params.motion)
+        carrier = deformation_transfer.DeformationTransfer(
+            params.face, new.neutral, FACES, deformation_transfer.anchor_weights(params.motion)
+        )
         mean = carrier(known.vertex_mean[None])[0].ravel()
         spread = sum(
             variance * np.outer(moved, moved)
@@ -84,7 +88,7 @@ def test_against_the_whole_gaussian(people, carried):
     for i in range(N):
         for j in range(N):
             far = np.sum((params.face[i] - params.face[j]) ** 2)
-            alike = np.mean([np.exp(-far / (2 * scale**2)) for scale in gpmm.SCALES])
+            alike = np.mean([np.exp(-far / (2 * scale**2)) for scale in gpmm.SMOOTH_SCALES_MM])
             spread[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += (
                 prior.smooth**2 * params.motion[i] * params.motion[j] * alike * np.eye(3)
             )
@@ -100,7 +104,7 @@ def test_against_the_whole_gaussian(people, carried):
 def test_answers_of_a_few_frames_are_those_of_the_map(people, carried, only):
     params, new = fit(people, carried, 0.1, 1e-2, components=4), person(7)
     whole = linear.apply(gpmm.linear_map(params, new.neutral), new.landmarks)
-    known = gpmm.covariances(params, new.neutral, only=only)
+    known = gpmm.covariances(params, new.neutral, vertex_index=only)
     found = gpmm.predict(known, params.prior, new.landmarks)
     np.testing.assert_allclose(found, whole if only is None else whole[:, only], atol=1e-4)
 

@@ -64,7 +64,7 @@ def test_a_face_is_worked_out_once_and_the_last_few_are_remembered(params, perso
     neutral, marks, _ = person
     asked = []
     true = gpmm.linear_map
-    monkeypatch.setattr(gpmm_residual, "FACES", 2)
+    monkeypatch.setattr(gpmm_residual, "CACHE_SIZE", 2)
     monkeypatch.setattr(gpmm, "linear_map", lambda base, face: asked.append(1) or true(base, face))
     faces = [neutral + shift for shift in (1.0, 2.0, 3.0)]
     first = [np.asarray(gpmm_residual.apply(params, marks, face)) for face in faces]

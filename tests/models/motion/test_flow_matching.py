@@ -192,7 +192,7 @@ def test_the_flow_learns_both_styles(rank):
         keys = jax.random.split(a, len(found))
         source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
         target = jax.vmap(flow_matching.to_state, (None, 0))(chart, found)
-        unit = jax.vmap(flow_matching.unit, (None, 0, 0))(chart, *condition[:2])
+        unit = jax.vmap(flow_matching.state_std, (None, 0, 0))(chart, *condition[:2])
         field = lambda state, time, one: flow_matching.velocity(
             flow_matching.FlowMatching(chart, weights), state, time, *one
         )  # noqa: E731

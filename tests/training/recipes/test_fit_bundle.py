@@ -22,7 +22,7 @@ def few():
         patch.setattr(fit_gpmm, "FOLDS", 2)
         patch.setattr(fit_gpmm, "SMOOTHNESS_GRID", (0.12,))
         patch.setattr(fit_gpmm, "NOISE_GRID", (1e-2,))
-        patch.setattr(fit_gpmm, "JUDGED", 1)
+        patch.setattr(fit_gpmm, "EVALUATED_PEOPLE", 1)
         yield
 
 
@@ -32,7 +32,7 @@ def models(few, tiny_store, tmp_path_factory):
 
 
 def test_models_of_ones_own_generate_from_a_file(models, tiny_store, tmp_path):
-    errors = vertex_error.of_models(models, tiny_store)
+    errors = vertex_error.model_errors(models, tiny_store)
     assert 0 < errors["head"] < errors["face"] < 0.3
     path = tmp_path / "own.safetensors"
     pipeline.save(path, models._replace(about=models.about | {"error_mm": errors}))
@@ -94,7 +94,7 @@ def test_the_command_trains_and_says_what_it_made(few, tiny_store, tmp_path, mon
         return pipeline.load()
 
     monkeypatch.setattr(fit_bundle, "fit", fit)
-    monkeypatch.setattr(vertex_error, "of_models", lambda models, data: {"head": 0.0123, "face": 0.0456})
+    monkeypatch.setattr(vertex_error, "model_errors", lambda models, data: {"head": 0.0123, "face": 0.0456})
     out = tmp_path / "new" / "m.safetensors"
     main.main(["fit", "--data", str(tiny_store.path), "--out", str(out), "--quick", "--seed", "3"])
     assert "0.012 mm over the mesh, 0.046 mm over the face" in capsys.readouterr().out

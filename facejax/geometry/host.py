@@ -1,0 +1,21 @@
+"""Geometry in NumPy, for code outside jit. Imports no JAX, so that worker processes which only read files start fast."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rigid motion that minimises the squared distance of source (K, 3) to target (K, 3).
+
+    Never a reflection (Kabsch 1976); `facejax.geometry.align.procrustes` is the JAX form. The rotation is float64.
+    A point x maps to rotation @ (x - source_centroid) + target_centroid; in float32 this loses fewer digits than a
+    rotation about the origin.
+
+    Returns:
+      rotation (3, 3) with determinant +1, source_centroid (3,), target_centroid (3,).
+    """
+    source_centroid, target_centroid = source.mean(axis=0), target.mean(axis=0)
+    rotation, _ = Rotation.align_vectors(target - target_centroid, source - source_centroid)
+    return rotation.as_matrix(), source_centroid, target_centroid
