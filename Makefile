@@ -55,7 +55,7 @@ lint: setup
 
 types: setup
 	$(INSTALL) -e ".[types]"
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright
 
 bench: setup geomstats
 	$(INSTALL) -e ".[bench,experiments]"

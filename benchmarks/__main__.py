@@ -22,7 +22,7 @@ from typing import Any
 import tyro
 
 from benchmarks import _compare, _headline, _measure, _sizes
-from facejax.io import atomic
+from facejax.io import atomic, errors
 
 ROOT = Path(__file__).parents[1]
 RESULTS = Path(__file__).with_name("results")
@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> int:
     try:
         return compare(config) if comparing else everything(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"benchmarks: {atomic.one_line(error)}", file=sys.stderr)
+        print(f"benchmarks: {errors.one_line(error)}", file=sys.stderr)
         return 2
 
 

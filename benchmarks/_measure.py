@@ -28,7 +28,7 @@ import tyro
 
 from benchmarks import _machine, _roofline, _sizes, _timing
 from facejax.cli import runtime
-from facejax.io import atomic
+from facejax.io import atomic, errors
 
 OURS = "facejax"
 Row = dict[str, Any]
@@ -102,7 +102,7 @@ def main(name: str, config_type: type[Chosen], run: Callable[[Chosen], Found]) -
         rows, sizes = run(config)
     except (ValueError, RuntimeError, OSError, AssertionError, IndexError, ZeroDivisionError) as error:
         said = f"the results of facejax and a peer differ: {error}" if isinstance(error, AssertionError) else str(error)
-        print(f"benchmarks.{name}: {atomic.one_line(said)}", file=sys.stderr)
+        print(f"benchmarks.{name}: {errors.one_line(said)}", file=sys.stderr)
         raise SystemExit(2) from None
     print(table(rows))
     if sizes:

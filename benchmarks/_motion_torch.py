@@ -180,7 +180,7 @@ class Flow(Peer):
 
 def check(peer: Peer, advance: Callable, start: loop.TrainState, rows: np.ndarray, held: Any) -> None:
     """Assert that three steps of the peer give the same metrics, weights and moving averages as facejax."""
-    state = jax.tree.map(jnp.copy, start)  # what is donated is the copy
+    state = jax.tree.map(jnp.copy, start)  # the copy is donated
     for step in range(3):
         draws = map(tensor, peer.draws(state, len(rows)))
         state, expected = advance(state, rows, held)

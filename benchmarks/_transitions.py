@@ -47,7 +47,7 @@ def problem(count: int, *, labels: int, people: int, steps: int, landmarks: int)
     """Return onsets of all labels but neutral by all people, and `count` of their index pairs, evenly spread."""
     end = np.repeat(np.arange(1, labels), people)
     curves = made_up(len(end), labels=labels, steps=steps, landmarks=landmarks, end=end).curves
-    pairs = augment.spread(end - 1, classes=labels - 1, per_pair=None)
+    pairs = augment.balanced_pairs(end - 1, classes=labels - 1, per_pair=None)
     if len(pairs) < count:
         raise ValueError(f"{people} people and {labels} labels make {len(pairs)} transitions; {count} are wanted")
     pairs = pairs[np.linspace(0, len(pairs) - 1, count).astype(int)]
@@ -57,7 +57,7 @@ def problem(count: int, *, labels: int, people: int, steps: int, landmarks: int)
 def forms(motions: augment.Motions, pairs: np.ndarray) -> dict[str, Callable[[], np.ndarray]]:
     """Return three implementations of all transitions at the "performed" pace, checked to agree, as functions."""
     host = augment.Motions(*map(np.asarray, motions))
-    options = {"frames": motions.q.shape[1] + 1, "pace": "performed", "chunk": CHUNK}
+    options = {"frames": motions.q.shape[1] + 1, "time_warp": "performed", "chunk": CHUNK}
     parts = [pairs[low : low + CHUNK] for low in range(0, len(pairs), CHUNK)]
     made = {
         "facejax": lambda: list(map(np.asarray, augment.transitions(motions, pairs, **options))),
@@ -74,7 +74,7 @@ def stream(*, count: int, pace: str, **sizes: int) -> dict[str, float]:
     """Run a pass over `count` transitions without keeping them; return time and peak memory before and after."""
     motions, pairs = problem(count, **sizes)
     jax.block_until_ready(motions)
-    before, options = _machine.peak_mb(), {"frames": motions.q.shape[1] + 1, "pace": pace, "chunk": CHUNK}
+    before, options = _machine.peak_mb(), {"frames": motions.q.shape[1] + 1, "time_warp": pace, "chunk": CHUNK}
 
     def walk(pairs: np.ndarray) -> float:
         begun = time.perf_counter()

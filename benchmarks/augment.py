@@ -90,7 +90,7 @@ def _selection(config: Config) -> _measure.Row:
 def _by_size(config: Config, sizes: dict[str, int]) -> list[dict]:
     def streamed(count: int, steps: int) -> Callable:
         motions, pairs = _transitions.problem(count, **sizes | {"steps": steps})
-        walk = partial(augment.transitions, motions, pairs, frames=steps + 1, pace="performed")
+        walk = partial(augment.transitions, motions, pairs, frames=steps + 1, time_warp="performed")
         return lambda: [np.asarray(part) for part in walk()]
 
     rows = _sizes.along(

@@ -72,7 +72,7 @@ def main(out: Path | None = None, steps: int = 60, seed: int = 0) -> dict[str, f
         return (optax.apply_updates(params, updates), opt_state, key), {"loss": value, "accuracy": accuracy}
 
     devices = sharding.data_mesh()
-    advance = jax.jit(sharding.data_parallel(step, mesh=devices), donate_argnums=0)
+    advance = jax.jit(sharding.data_parallel(step, device_mesh=devices), donate_argnums=0)
     state = (params, optimiser.init(params), data_key)
     classes = jnp.arange(BATCH) % (len(LABELS) - 1)
     rows = []

@@ -24,7 +24,7 @@ import tyro
 
 from facejax.cli import runtime
 from facejax.evaluation import run_record
-from facejax.io import atomic
+from facejax.io import atomic, errors
 
 PREPARES = "The first run prepares makehuman4d in the user's cache: about 4 minutes and 0.8 GB per level."
 RESULTS = Path(__file__).parent / "results"
@@ -45,7 +45,7 @@ def main(name: str, config_type: type[Config], run: Callable[[Config], dict[str,
         _check_publish(config)
         run(config)
     except (ValueError, RuntimeError, OSError) as error:
-        print(f"experiments.{name}: {atomic.one_line(error)}", file=sys.stderr)
+        print(f"experiments.{name}: {errors.one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from error
     print(f"results in {config.out}")
 

@@ -4,8 +4,8 @@ One LSTM for each of the six basic emotions, on makehuman4d. Three tasks: the ne
 step); the rest of a sequence, given its first ten frames; and a whole sequence from the neutral face alone. The
 baselines are constant velocity and the mean sequence of the training subjects. The training variant is chosen on the
 validation subjects, the final figures are those of the test subjects; 120 more people, drawn with a separate seed,
-are added to either, since 20 people are too few to tell variants apart. The variant "paper" is SL21's training on
-true inputs (10,000 steps, constant rate); the variants "truth" train on true inputs for 3,000 steps, with a decaying
+are added to either, since 20 people are too few to tell variants apart. The variant "paper" trains on true inputs for
+10,000 steps at a constant rate (SL21: 10,000 epochs); the variants "truth" do so for 3,000 steps with a decaying
 rate.
 
     python -m experiments.expression_lstm --publish

@@ -123,7 +123,7 @@ def _performed(config: Config, models: pipeline.Models) -> list[_motion_transfer
     template, known = makehuman.template(), set(itertools.chain(*CHAINS))
     same = np.array_equal(template.faces, models.face.faces) and np.array_equal(template.landmarks, index)
     if not same or not known <= set(models.labels):
-        raise ValueError(f"{config.model}: was made of another dataset than makehuman4d: name it with --data")
+        raise ValueError(f"{config.model}: trained on another dataset than makehuman4d: give that dataset with --data")
     if len(numbers) != 3:
         raise ValueError(f"--people: expected three numbers, got {config.people}")
     people = [makehuman.subject(i, seed=makehuman4d.SEED) for i in numbers]
@@ -152,7 +152,7 @@ def _stored(config: Config, models: pipeline.Models) -> tuple[list[tuple[str, ..
             rng = np.random.default_rng(config.seed)
             names = [rng.permutation(data.labels[1:])[:4].tolist() for _ in CHAINS]
             return [(data.labels[0], *chain, data.labels[0]) for chain in names], takes
-    raise ValueError(f"{data.path}: has no label under which the people {numbers} all have recordings with meshes")
+    raise ValueError(f"{data.path}: found no label with recordings and meshes of all people {numbers}")
 
 
 def _dataset(models: pipeline.Models) -> dict[str, Any]:

@@ -56,7 +56,7 @@ class Config(_mesh_eval.Options):
     recording: Path | None = None
     """CSV file of a recording of speech by Epic's free iPhone app Live Link Face."""
     data: Path | None = None
-    """A prepared dataset to learn from, in place of makehuman4d."""
+    """Prepared dataset to train on, in place of makehuman4d."""
     speech: Path | None = None
     """Prepared dataset whose recordings are transferred from person to person, in place of --recording."""
     people: int = 11

@@ -1,16 +1,16 @@
-"""Peak-to-peak transitions made of performed neutral-to-peak motions, and their selection.
+"""Synthesis of peak-to-peak transitions from recorded neutral-to-peak motions, and their selection.
 
 A recorded sequence goes neutral -> peak -> neutral; a generator of transitions between any two expressions
-also needs peak -> peak. Otberdout et al. 2023, section 4.1: walk along the geodesic between the SRVFs of two
+also needs peak -> peak. Otberdout et al. 2023, section 4.1: follow the geodesic between the SRVFs of two
 neutral-to-peak motions; every point on it is a motion, and their last frames, in order, are a transition from
 the first peak to the second. Of the hundreds of thousands of pairs, those nearest to the mean peaks of their
 two expressions ("prototypes") are kept.
 
-The paper walks at an even pace, so that its transitions start and stop at once. Here the walk may go at the pace
-at which the second expression was performed, which has an onset.
+The paper follows the geodesic at constant speed, so that its transitions start and stop abruptly. Here the speed may
+also be that of the second recorded motion, which has an onset.
 
-`halves`, `transition` and `transitions` are array functions. `prototypes`, `select`, `spread` and `sample_per_pair`
-choose data once, on the host, in NumPy: the number of rows they return depends on the labels.
+`split_at_peak`, `transition` and `transitions` are array functions. `prototypes`, `select`, `balanced_pairs` and
+`sample_per_pair` choose data once, on the host, in NumPy: the number of rows that they return depends on the labels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TIME_WARPS = ("even", "performed")
 
 
 class Motions(NamedTuple):
-    """K motions as `facejax.geometry.srvf.encode` gives them, with their first frames."""
+    """K motions, encoded by `facejax.geometry.srvf.encode`, with their first frames."""
 
     q: jax.Array  # (K, T-1, L, 3), on the unit sphere
     log_length: jax.Array  # (K,)
@@ -44,17 +44,17 @@ class Selection(NamedTuple):
 
 @jax.jit
 def apex(curve: jax.Array) -> jax.Array:
-    """The frame (...) of a curve (..., T, L, 3) that is farthest, over all landmarks, from its first one."""
+    """Return the frame (...) of a curve (..., T, L, 3) farthest from its first one, over all landmarks."""
     _check_curve(curve)
     away = jnp.sum((curve - curve[..., :1, :, :]) ** 2, axis=(-2, -1))
     return jnp.argmax(away, axis=-1)
 
 
 @jax.jit(static_argnames=("frames",))
-def halves(curve: jax.Array, peak: jax.Array | int, *, frames: int = 30) -> tuple[jax.Array, jax.Array]:
+def split_at_peak(curve: jax.Array, peak: jax.Array | int, *, frames: int = 30) -> tuple[jax.Array, jax.Array]:
     """Cut a curve (..., T, L, 3) at the frame `peak` (...) into onset and offset, each (..., frames, L, 3).
 
-    Both hold the peak; time is resampled evenly within each half.
+    Both contain the peak; time is resampled evenly within each half. Raises `ValueError` for fewer than 2 frames.
     """
     _check_curve(curve)
     if frames < 2:
@@ -77,7 +77,7 @@ def transition(
     *,
     frames: int = 30,
 ) -> jax.Array:
-    """Landmarks (..., frames, L, 3) that go from the last frame of motion 1 to the last frame of motion 2.
+    """Return landmarks (..., frames, L, 3) from the last frame of motion 1 to the last frame of motion 2.
 
     q1, q2 are (..., T-1, L, 3) on the unit sphere, log lengths (...), starts (..., L, 3). A frame is the last frame
     of the motion at a fraction tau in [0, 1] of the geodesic (eq. 10), its log-length and start interpolated
@@ -103,7 +103,7 @@ def transition(
     flat = [x.reshape(*x.shape[:-2], 3 * x.shape[-2]) for x in (q1, w)]  # a CPU is slow at rows of three
     pp, pw, ww = (jnp.sum(x * y, axis=-1)[..., None, :] for x, y in ((flat[0],) * 2, flat, (flat[1],) * 2))
     # Rounding may leave the square of a step that cancels just below 0; the root takes it as 0.
-    pace = sphere.root(a**2 * pp + 2 * a * b * pw + b**2 * ww)
+    pace = sphere.safe_sqrt(a**2 * pp + 2 * a * b * pw + b**2 * ww)
     moves = sum(jnp.einsum("...ft,...td->...fd", part * pace, x) for part, x in zip((a, b), flat, strict=True))
     moves = moves.reshape(*moves.shape[:-1], *q1.shape[-2:])
     log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])
@@ -116,10 +116,10 @@ def transitions(
 ) -> Iterator[jax.Array]:
     """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
 
-    `time_warp`: "even", or "performed", at which the fraction of the geodesic walked by a frame is the share of its path
-    that the second motion has covered by then. Memory does not grow with P. The last chunk is padded inside, so that
-    all share one compilation. Raises `ValueError` on an unknown pace or a malformed or out-of-range pair, before
-    anything is computed.
+    `time_warp`: "even" in time, or "performed": the fraction of the geodesic at a frame is the fraction of its arc
+    length that the second motion has covered by then. Memory does not grow with P. The last chunk is padded internally,
+    so that all share one compilation. Raises `ValueError` on an unknown time warp or a malformed or out-of-range pair,
+    before anything is computed.
     """
     pairs = np.asarray(pairs)
     count = len(motions.q)
@@ -128,21 +128,23 @@ def transitions(
     if chunk < 1:
         raise ValueError(f"chunk: expected at least 1, got {chunk}")
     if time_warp not in TIME_WARPS:
-        raise ValueError(f"pace: expected one of {TIME_WARPS}, got {time_warp!r}")
+        raise ValueError(f"time_warp: expected one of {TIME_WARPS}, got {time_warp!r}")
     if pairs.size and not (pairs.min() >= 0 and pairs.max() < count):
         raise ValueError(f"pairs: expected indices in [0, {count}), got {pairs.min()} to {pairs.max()}")
     return _stream(motions, pairs, frames, time_warp, min(chunk, max(len(pairs), 1)))
 
 
 def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.ndarray:
-    """The mean peak (classes, L, 3) of each class, from peaks (K, L, 3) and labels (K,) in [0, classes).
+    """Return the mean peak (classes, L, 3) of each class, from peaks (K, L, 3) and labels (K,) in [0, classes).
 
-    Raises `ValueError` where a class has no peak: it has no mean.
+    Raises `ValueError` where a class has no peak, and for labels out of range.
     """
     peaks, labels = _labelled(peaks, labels, classes)
     counts = np.bincount(labels, minlength=classes)
     if not counts.all():
-        raise ValueError(f"labels: expected every class at least once, got none of {np.flatnonzero(counts == 0)}")
+        raise ValueError(
+            f"labels: expected every class at least once, got none of classes {np.flatnonzero(counts == 0)}"
+        )
     sums = np.zeros((classes, *peaks.shape[1:]))
     np.add.at(sums, labels, peaks)
     return sums / counts[:, None, None]
@@ -151,13 +153,13 @@ def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.nda
 def select(
     peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per_pair: int, reuse: int | None = None
 ) -> Selection:
-    """For each ordered pair of different classes, the `per_pair` transitions nearest to the two prototypes.
+    """Select for each ordered pair of different classes the `per_pair` transitions nearest to the two prototypes.
 
     peaks are (K, L, 3), labels (K,), prototypes (classes, L, 3). The distance of a transition is the L2 norm
     of (start, end) - (prototype of start, prototype of end). With `reuse`, transitions are taken nearest
-    first and none whose start, or whose end, has served `reuse` times in the pair: a few peaks close to their
-    prototype would otherwise make most of the selection. Pairs with fewer transitions give all they have; a
-    class may be absent. Ties go to the lower indices.
+    first, each start and each end at most `reuse` times per pair: a few peaks close to their prototype would
+    otherwise dominate the selection. Pairs with fewer transitions give all of them; a class may be absent.
+    Ties go to the lower indices.
     """
     prototypes = np.asarray(prototypes, np.float64)
     peaks, labels = _labelled(peaks, labels, len(prototypes))
@@ -179,11 +181,11 @@ def select(
     return Selection(np.concatenate(pairs), np.concatenate(distances))
 
 
-def spread(labels: np.ndarray, *, classes: int, per_pair: int | None = None, seed: int = 0) -> np.ndarray:
-    """Index pairs (P, 2) int32 of motions with labels (K,), for each ordered pair of different classes, unselected.
+def balanced_pairs(labels: np.ndarray, *, classes: int, per_pair: int | None = None, seed: int = 0) -> np.ndarray:
+    """Draw index pairs (P, 2) int32 of motions with labels (K,), for each ordered pair of different classes.
 
-    `per_pair` different ones of each (None, or more than there are: all), in which every start and every end serves
-    equally often, give or take one; who meets whom is drawn. Ordered by class of start, class of end.
+    `per_pair` distinct pairs of each (None, or more than exist: all), in which every start and every end occurs
+    equally often, within one; the pairing is random. Ordered by class of start, class of end.
     """
     if per_pair is not None and per_pair < 1:
         raise ValueError(f"per_pair: expected at least 1, got {per_pair}")
@@ -195,17 +197,17 @@ def spread(labels: np.ndarray, *, classes: int, per_pair: int | None = None, see
         total = len(first) * len(second)
         if total:
             k = np.arange(total if per_pair is None else min(per_pair, total))
-            # Both run round; when they would meet as they did at first, one moves on by a place.
+            # Both lists are cycled; when the pairing would repeat, one is shifted by one.
             turn = k // np.lcm(len(first), len(second))
             pairs.append(np.stack([first[k % len(first)], second[(k + turn) % len(second)]], axis=1).astype(np.int32))
     return np.concatenate(pairs)
 
 
 def sample_per_pair(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.ndarray:
-    """A mask (K,) that picks one motion, drawn by seed, of each (start, end) that occurs: OT23's test set."""
+    """Return a mask (K,) that selects one random motion of each (start, end) that occurs: OT23's test set."""
     start, end = np.asarray(start), np.asarray(end)
     if start.shape != end.shape or start.ndim != 1:
-        raise ValueError(f"start, end: expected two (K,), got {start.shape} and {end.shape}")
+        raise ValueError(f"start, end: expected two arrays (K,), got {start.shape} and {end.shape}")
     order = np.random.default_rng(seed).permutation(len(start))
     _, first = np.unique(np.stack([start, end], axis=1)[order], axis=0, return_index=True)
     mask = np.zeros(len(start), bool)
@@ -214,7 +216,7 @@ def sample_per_pair(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.
 
 
 def _candidates(starts: int, ends: int, count: int, reuse: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Ranks (M,) of start and end among which the `count` nearest transitions are, without the full product.
+    """Return ranks (M,) of start and end that contain the `count` nearest transitions, without the full product.
 
     A transition starts and ends at the two peaks themselves, so its squared distance is the sum of theirs:
     both classes are sorted, and rank (r, s) is at least as far as every (r' <= r, s' <= s).
@@ -225,8 +227,8 @@ def _candidates(starts: int, ends: int, count: int, reuse: int | None) -> tuple[
         widths = np.minimum(count // np.arange(1, min(count, starts) + 1), ends)
         first = np.repeat(np.arange(len(widths)), widths)
         return first, np.arange(len(first)) - np.repeat(np.cumsum(widths) - widths, widths)
-    # Nearest first, the starts and ends of ranks below `reuse` take all of one another, which uses them up,
-    # and the next `reuse` ranks follow: square blocks along the diagonal, each no nearer than the one before.
+    # Nearest first, the starts and ends of ranks below `reuse` are all combined, which exhausts them, and the
+    # next `reuse` ranks follow: square blocks along the diagonal, each no nearer than the one before.
     blocks = -(-count // reuse**2)
     ranks = np.arange(min(blocks * reuse, starts))
     first, second = np.repeat(ranks, reuse), (ranks[:, None] // reuse * reuse + np.arange(reuse)).reshape(-1)

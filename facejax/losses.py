@@ -1,9 +1,9 @@
-"""Losses: Wasserstein with gradient penalty for motion, displacement L1 for meshes, steps of expression networks.
+"""Loss functions: Wasserstein with gradient penalty for motion, displacement L1 for meshes, steps for LSTMs.
 
-Vocabulary: a *sample* is any pytree of arrays; a *condition* is what both players of the game are told
-about it (here: the two labels). `score(sample, condition)` judges ONE sample and returns a scalar. Mesh
-losses take displacements in millimetres with leading axes free; they sum over x, y, z, take the mean over
-the vertices and over the leading axes, so that a figure reads "millimetres (L1) per vertex".
+Vocabulary: a *sample* is any pytree of arrays; a *condition* is the conditioning input of generator and
+critic (here: the two labels). `score(sample, condition)` is the critic of ONE sample and returns a scalar.
+Mesh losses take displacements in millimetres with leading axes free; they sum over x, y, z and take the mean
+over the vertices and the leading axes, so that values are "millimetres (L1) per vertex".
 
 Functions that take arrays are jitted; those that take a `score` are left to the caller's jit.
 """
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from facejax.geometry import sphere
-from facejax.geometry.sphere import root
+from facejax.geometry.sphere import safe_sqrt
 
 Sample = Any
 Condition = Any
@@ -24,11 +24,11 @@ Score = Callable[[Sample, Condition], jax.Array]
 
 
 def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, condition: Condition) -> jax.Array:
-    """Mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
+    """Return the mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
 
-    `real`, `fake`: trees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all
+    `real`, `fake`: pytrees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all
     leaves; the norm is the Euclidean one over all leaves together. Otberdout et al. 2023, last term of eq
-    2, and eq 5; the condition goes into this term too, which eq 2 leaves out. Where the gradient vanishes
+    2, and eq 5; this term is conditioned too, which eq 2 leaves out. Where the gradient vanishes
     the norm's derivative is taken as 0.
     """
     tau = jax.random.uniform(key, (jax.tree.leaves(real)[0].shape[0],))
@@ -53,7 +53,7 @@ def critic(
     *,
     penalty: float = 10.0,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """What the critic minimises: E[score(fake)] - E[score(real)] + penalty * gradient penalty.
+    """Return the critic's loss, E[score(fake)] - E[score(real)] + penalty * gradient penalty.
 
     Samples and conditions have a leading axis B. Returns the loss and its terms: `wasserstein` (the estimated
     distance, E[score(real)] - E[score(fake)]) and `slope` (the penalty before its weight).
@@ -66,13 +66,13 @@ def critic(
 
 
 def generator(score: Score, fake: Sample, condition: Condition) -> jax.Array:
-    """The generator's adversarial term, -E[score(fake)]; samples and conditions have a leading axis B."""
+    """Return the generator's adversarial loss, -E[score(fake)]; samples and conditions have a leading axis B."""
     return -jnp.mean(jax.vmap(score)(fake, condition))
 
 
 @jax.jit
 def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
-    """Mean absolute difference of two stacks of tangent vectors (..., T-1, L, 3), or of any two equal shapes.
+    """Return the mean absolute difference of two arrays of tangent vectors (..., T-1, L, 3), or of any equal shapes.
 
     Otberdout et al. 2023, eq 6; the mean over entries, not the sum.
     """
@@ -81,14 +81,15 @@ def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
 
 
 def flow_matching(
-    field: Callable, key: jax.Array, source: Sample, target: Sample, condition: Condition, unit: jax.Array
+    field: Callable, key: jax.Array, source: Sample, target: Sample, condition: Condition, scale: jax.Array
 ) -> jax.Array:
-    """How far a velocity field is from the velocities of the geodesics between samples of source and target.
+    """Return the mean squared error of a velocity field against geodesics between samples of source and target.
 
-    Samples are (y, s): y (B, 1, 1, C) on a unit sphere, s (B, S). `field(state, time, condition) -> (v, rate)` handles
-    ONE state, and gives a tangent vector at y and the rate of s. One time in [0, 1) per sample. Along a geodesic the
-    velocity is log(source, target), carried along. Squares are taken in units of `unit` (B, C) along y's entries, so
-    that narrow directions count as much as wide ones; the mean is over all entries. Chen & Lipman 2024, eq. 15.
+    Samples are (y, s): y (B, 1, 1, C) on a unit sphere, s (B, S). `field(state, time, condition) -> (v, rate)` takes
+    ONE state and returns a tangent vector at y and the rate of s. One time in [0, 1) per sample. Along a geodesic the
+    velocity is log(source, target), transported in parallel. Squares are taken in units of `scale` (B, C) along y's
+    entries, so that directions of small variance count as much as others; the mean is over all entries. Chen & Lipman
+    2024, eq. 15.
     """
     (y0, s0), (y1, s1) = source, target
     time = jax.random.uniform(key, y0.shape[:1])
@@ -97,13 +98,13 @@ def flow_matching(
     wanted = sphere.transport(y0, y, way)
     between = y, s0 + time[:, None] * (s1 - s0)
     found, rate = jax.vmap(field)(between, time, condition)
-    off = (found - wanted)[:, 0, 0] / unit
+    off = (found - wanted)[:, 0, 0] / scale
     return jnp.mean(jnp.concatenate([off, rate - (s1 - s0)], axis=-1) ** 2)
 
 
 @jax.jit
 def displacement_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
-    """L1 error of displacements (..., N, 3) in mm: sum over xyz, mean over vertices and leading axes.
+    """Return the L1 error of displacements (..., N, 3) in mm: sum over xyz, mean over vertices and leading axes.
 
     Otberdout et al. 2023, eq 8.
     """
@@ -113,13 +114,13 @@ def displacement_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
 
 @jax.jit
 def weighted_l1(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
-    """`displacement_l1` with every vertex's error times its weight (N,); the mean still divides by N.
+    """Return `displacement_l1` with every vertex's error times its weight (N,); the mean still divides by N.
 
-    Otberdout et al. 2023, eq 9. Meshes or displacements alike: the neutral face cancels in the difference.
+    Otberdout et al. 2023, eq 9. Takes meshes or displacements: the neutral face cancels in the difference.
     """
     _same_shape(predicted, target)
     if weights.shape != predicted.shape[-2:-1]:
-        raise ValueError(f"weights must have shape {predicted.shape[-2:-1]}, one per vertex; got {weights.shape}")
+        raise ValueError(f"weights: expected shape {predicted.shape[-2:-1]}, one per vertex, got {weights.shape}")
     return jnp.mean(weights * jnp.sum(jnp.abs(predicted - target), axis=-1))
 
 
@@ -133,12 +134,12 @@ def s2d(
     beta2: float = 0.1,
     reduction: str = "paper",
 ) -> jax.Array:
-    """The mesh decoder's loss on displacements (..., N, 3) in mm, with vertex weights (N,).
+    """Return the mesh decoder's loss on displacements (..., N, 3) in mm, with vertex weights (N,).
 
     `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure
     the same residual, so with weights of 1 this is (beta1 + beta2) times the first term alone. `reference`:
-    as the authors' program does it: the two factors swap places, and the weighted term is a sum over the
-    vertices, so that it outweighs the other some N times.
+    as in the authors' program: the two factors are swapped, and the weighted term is a sum over the
+    vertices, so that it outweighs the other about N times. Raises `ValueError` for another reduction.
     """
     plain = displacement_l1(predicted, target)
     weighted = weighted_l1(predicted, target, weights)
@@ -146,7 +147,7 @@ def s2d(
         return beta1 * plain + beta2 * weighted
     if reduction == "reference":
         return beta2 * plain + beta1 * weighted * predicted.shape[-2]
-    raise ValueError(f"reduction must be 'paper' or 'reference'; got {reduction!r}")
+    raise ValueError(f"reduction: expected 'paper' or 'reference', got {reduction!r}")
 
 
 @partial(jax.jit, static_argnames="mode")
@@ -157,35 +158,35 @@ def landmark_weights(
     mode: str = "linear",
     edge_length: float | None = None,
 ) -> jax.Array:
-    """Vertex weights (N,) in [0, 1]: 1 at the landmarks, falling with the distance d to the nearest one.
+    """Return vertex weights (N,) in [0, 1]: 1 at the landmarks, falling with the distance d to the nearest one.
 
     `vertices` (N, 3), `landmark_indices` (L,) of vertices. `linear`: 1 - d / d_max, which the authors'
-    published weights follow. `inverse`: the paper's 1 / d, held at 1 / edge_length nearer than that (it is
-    infinite at the landmarks), then divided by its largest value; give `edge_length` as the mean edge
+    published weights follow. `inverse`: the paper's 1 / d, clipped to 1 / edge_length (it is infinite at the
+    landmarks), then divided by its largest value; give `edge_length` as the mean edge
     length of the mesh, in the unit of the vertices. `none`: 1 everywhere.
     """
     if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise ValueError(f"vertices must have shape (N, 3); got {vertices.shape}")
+        raise ValueError(f"vertices: expected shape (N, 3), got {vertices.shape}")
     if mode not in ("linear", "inverse", "none"):
-        raise ValueError(f"mode must be 'linear', 'inverse' or 'none'; got {mode!r}")
+        raise ValueError(f"mode: expected 'linear', 'inverse' or 'none', got {mode!r}")
     if mode == "none":
         return jnp.ones_like(vertices[:, 0])
     offsets = vertices[:, None] - vertices[landmark_indices]
-    distance = root(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
+    distance = safe_sqrt(jnp.min(jnp.sum(jnp.square(offsets), axis=-1), axis=-1))
     if mode == "linear":
         farthest = jnp.max(distance)
-        # The farthest vertex may round below 0. Where all are landmarks, nothing falls.
+        # The farthest vertex may round below 0. Where all vertices are landmarks, all weights are 1.
         return jnp.maximum(1.0 - distance / jnp.where(farthest > 0, farthest, 1.0), 0.0)
     if edge_length is None:
-        raise ValueError("mode 'inverse' needs edge_length, the mean edge length of the mesh")
+        raise ValueError("edge_length: mode 'inverse' needs the mean edge length of the mesh, got None")
     return edge_length / jnp.maximum(distance, edge_length)
 
 
 @jax.jit
 def next_step(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean squared error of steps (..., T, L, 3) over the entries where the mask (..., T) is set.
+    """Return the mean squared error of steps (..., T, L, 3) over the frames where the mask (..., T) is set.
 
-    Seo and Luo 2021, L_disp: a sum in the formula, a mean in the text; the mean here. An empty mask gives 0.
+    Seo and Luo 2021, L_disp: a sum in the formula, a mean in the text; here the mean. An empty mask gives 0.
     """
     _same_steps(predicted, target, mask)
     error = jnp.mean(jnp.square(predicted - target), axis=(-2, -1))
@@ -193,35 +194,34 @@ def next_step(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.A
 
 
 @jax.jit
-def path(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean distance of the landmarks that steps (..., T, L, 3) lead to, over frames where the mask (..., T) is set.
+def path_distance(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+    """Return the mean distance of the positions that steps (..., T, L, 3) add up to, where the mask (..., T) is set.
 
-    Errors of single steps add up along the way; this measures where the face has got to. A distance, not its square:
-    the best single path is then the median of many, which is the path of somebody where the mean is nobody's.
+    Errors of single steps accumulate; this measures the positions. It is a distance, not its square: the optimal
+    prediction is then the median of the possible paths, which is near an actual one, while the mean need not be.
     """
     _same_steps(predicted, target, mask)
     missed = jnp.cumsum(jnp.where(mask[..., None, None], predicted - target, 0), axis=-3)
-    return _masked_mean(jnp.mean(root(jnp.sum(jnp.square(missed), axis=-1)), axis=-1), mask)
+    return _masked_mean(jnp.mean(safe_sqrt(jnp.sum(jnp.square(missed), axis=-1)), axis=-1), mask)
 
 
 @jax.jit
-def strength(steps: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean squares of steps (..., T, L, 3) and of their differences in time, (2,), where the mask (..., T) is set."""
+def step_energy(steps: jax.Array, mask: jax.Array) -> jax.Array:
+    """Return the mean squares (2,) of steps (..., T, L, 3) and of their differences in time, where the mask is set."""
     _same_steps(steps, steps, mask)
     parts = ((steps, mask), (jnp.diff(steps, axis=-3), mask[..., 1:] & mask[..., :-1]))
     return jnp.stack([_masked_mean(jnp.mean(jnp.square(values), axis=(-2, -1)), where) for values, where in parts])
 
 
 @jax.jit
-def energy(predicted: jax.Array, mask: jax.Array, wanted: jax.Array) -> jax.Array:
-    """How far motion is from the strength that it should have, whatever its direction.
+def energy_ratio(predicted: jax.Array, mask: jax.Array, reference: jax.Array) -> jax.Array:
+    """Return the penalty (r - 1)^2 on the ratio r of the motion's root mean square to that of the training set.
 
-    (r - 1)^2 for r the ratio of root mean squares, of steps (..., T, L, 3) and of their differences, both over all
-    sequences where the mask (..., T) is set; `wanted` (2,) is the `strength` of the training set. A network that cannot
-    know what comes next predicts the mean of all possibilities, which moves less than any of them. An empty mask
-    gives 0.
+    Summed over two ratios, of steps (..., T, L, 3) and of their differences, both over all sequences where the mask
+    (..., T) is set; `reference` (2,) is the `step_energy` of the training set. A network trained on squared errors
+    predicts the mean of the possible motions, which moves less than any of them. An empty mask gives 0.
     """
-    ratio = root(strength(predicted, mask) / wanted)
+    ratio = safe_sqrt(step_energy(predicted, mask) / reference)
     return jnp.where(jnp.any(mask), jnp.sum(jnp.square(ratio - 1)), 0)
 
 
@@ -232,9 +232,9 @@ def _masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
 def _same_steps(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> None:
     _same_shape(predicted, target)
     if predicted.ndim < 3 or mask.shape != predicted.shape[:-2]:
-        raise ValueError(f"mask must have shape {predicted.shape[:-2]}, one per frame of steps; got {mask.shape}")
+        raise ValueError(f"mask: expected shape {predicted.shape[:-2]}, one per frame of steps, got {mask.shape}")
 
 
 def _same_shape(predicted: jax.Array, target: jax.Array) -> None:
     if predicted.shape != target.shape:
-        raise ValueError(f"predicted and target must have one shape; got {predicted.shape} and {target.shape}")
+        raise ValueError(f"predicted, target: expected equal shapes, got {predicted.shape} and {target.shape}")

@@ -1,4 +1,4 @@
-"""Measures of meshes and motions, in the unit of their input: give millimetres to read millimetres.
+"""Metrics of meshes and motions, in the unit of their input.
 
 Meshes are (..., N, 3), motions (..., T, L, 3). The distance of two motions is the Euclidean distance per
 landmark, averaged over landmarks and frames. Specificity, diversity and their real-data ceilings follow
@@ -28,31 +28,31 @@ class Error(NamedTuple):
 
 @jax.jit
 def vertex_distance(predicted: jax.Array, target: jax.Array) -> jax.Array:
-    """The Euclidean distance (..., N) of each vertex of predicted and target (..., N, 3)."""
+    """Return the Euclidean distance (..., N) of each vertex of predicted to target (..., N, 3)."""
     _check_same(predicted, target, 2)
     return _norm(predicted - target)
 
 
 @jax.jit
 def vertex_error(predicted: jax.Array, target: jax.Array, mask: jax.Array | None = None) -> Error:
-    """Mean and population standard deviation of `vertex_distance` over all vertices x frames x leading axes.
+    """Return mean and population standard deviation of `vertex_distance` over vertices, frames and leading axes.
 
-    mask (N,), bool or weights, picks the vertices that count (a face without its head, say). An empty mask
-    gives NaN. Use `pool` for data that arrive in parts.
+    mask (N,), bool or weights, selects vertices (a face region, for example). An empty mask gives NaN. Use `pool` for
+    data in parts.
     """
     distance = vertex_distance(predicted, target)
     if mask is not None and jnp.shape(mask) != distance.shape[-1:]:
         raise ValueError(f"mask: expected ({distance.shape[-1]},), got {jnp.shape(mask)}")
     weights = jnp.ones(distance.shape[-1], distance.dtype) if mask is None else jnp.asarray(mask, distance.dtype)
     share = weights / jnp.sum(weights)
-    # Vertices first, frames after: one float32 sum over 10^8 numbers would lose digits.
+    # Vertices first, frames after: a single float32 sum over 10^8 numbers would lose digits.
     mean = jnp.mean(distance @ share)
-    std = sphere.root(jnp.mean((distance - mean) ** 2 @ share))
+    std = sphere.safe_sqrt(jnp.mean((distance - mean) ** 2 @ share))
     return Error(mean, std, jnp.sum(weights) * (distance.size // distance.shape[-1]))
 
 
 def pool(errors: Sequence[Error]) -> Error:
-    """The error over all parts (folds, batches) together, from their errors, in float64 on the host."""
+    """Combine the errors of parts (folds, batches) into the error over all of them, in float64 on the host."""
     if not errors:
         raise ValueError("errors: expected at least one, got none")
     mean, std, count = np.asarray([[float(x) for x in error] for error in errors]).T
@@ -63,17 +63,17 @@ def pool(errors: Sequence[Error]) -> Error:
 
 @jax.jit
 def speed(landmarks: jax.Array) -> jax.Array:
-    """Mean norm (...) of the first differences in time of each landmark (..., T, L, 3), per frame."""
+    """Return the mean norm (...) of the first differences in time of landmarks (..., T, L, 3), per frame."""
     _check_motion(landmarks, 2)
     return jnp.mean(_norm(jnp.diff(landmarks, axis=-3)), axis=(-2, -1))
 
 
 @jax.jit
 def acceleration(landmarks: jax.Array) -> jax.Array:
-    """Mean norm (...) of the second differences in time of each landmark (..., T, L, 3), per frame squared.
+    """Return the mean norm (...) of the second differences in time of landmarks (..., T, L, 3), per frame squared.
 
-    It measures jitter: noise of deviation s in every coordinate adds about 3.9 s (the mean norm of 3
-    coordinates of deviation s sqrt 6).
+    It measures jitter: noise of standard deviation s in every coordinate adds about 3.9 s (the mean norm of 3
+    coordinates of standard deviation s sqrt 6).
     """
     _check_motion(landmarks, 3)
     return jnp.mean(_norm(jnp.diff(landmarks, n=2, axis=-3)), axis=(-2, -1))
@@ -81,7 +81,7 @@ def acceleration(landmarks: jax.Array) -> jax.Array:
 
 @jax.jit
 def peak_displacement(landmarks: jax.Array, neutral: jax.Array) -> jax.Array:
-    """Mean displacement (...) of landmarks (..., T, L, 3) from neutral (..., L, 3), in its largest frame."""
+    """Return the mean displacement (...) of landmarks (..., T, L, 3) from neutral (..., L, 3), largest over frames."""
     _check_motion(landmarks, 1)
     if jnp.shape(neutral)[-2:] != landmarks.shape[-2:]:
         raise ValueError(f"neutral: expected (..., {landmarks.shape[-2]}, 3), got {jnp.shape(neutral)}")
@@ -90,7 +90,7 @@ def peak_displacement(landmarks: jax.Array, neutral: jax.Array) -> jax.Array:
 
 @jax.jit
 def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
-    """Mean distance (...) of samples (..., K, T, L, 3) to the one reference (..., T, L, 3)."""
+    """Return the mean distance (...) of samples (..., K, T, L, 3) to the one reference (..., T, L, 3)."""
     _check_motion(samples, 1, axes=4)
     if jnp.shape(reference)[-3:] != samples.shape[-3:]:
         raise ValueError(f"reference: expected (..., {samples.shape[-3:]}), got {jnp.shape(reference)}")
@@ -99,7 +99,7 @@ def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
 
 @jax.jit
 def distances(a: jax.Array, b: jax.Array) -> jax.Array:
-    """The distance (K, M) of each motion of a (K, T, L, 3) to each of b (M, T, L, 3)."""
+    """Return the distance (K, M) of each motion of a (K, T, L, 3) to each of b (M, T, L, 3)."""
     _check_motion(a, 1, axes=4)
     _check_motion(b, 1, axes=4)
     if a.ndim != 4 or b.ndim != 4 or a.shape[1:] != b.shape[1:]:
@@ -109,7 +109,7 @@ def distances(a: jax.Array, b: jax.Array) -> jax.Array:
 
 @jax.jit
 def mean_off_diagonal(own: jax.Array) -> jax.Array:
-    """The mean () of a square table (K, K), K >= 2, without its diagonal."""
+    """Return the mean () of a square table (K, K), K >= 2, without its diagonal."""
     if own.ndim != 2 or own.shape[0] != own.shape[1] or len(own) < 2:
         raise ValueError(f"expected (K, K) with K >= 2, got {own.shape}")
     return (jnp.sum(own) - jnp.trace(own)) / (len(own) * (len(own) - 1))
@@ -117,9 +117,9 @@ def mean_off_diagonal(own: jax.Array) -> jax.Array:
 
 @jax.jit(static_argnames=("neighbours",))
 def coverage(across: jax.Array, real: jax.Array, *, neighbours: int = 5) -> jax.Array:
-    """The share () of real motions near which one was generated; tables (K, M) and (M, M) of `distances`.
+    """Return the fraction () of real motions near a generated one, from tables (K, M) and (M, M) of `distances`.
 
-    Near: within the distance of the real motion's neighbour of that rank among the real. Naeem et al. 2020.
+    Near: within the distance of the real motion's k-th real neighbour, k = `neighbours`. Naeem et al. 2020.
     """
     if across.shape[1:] != real.shape[:1] or not 0 < neighbours < len(real):
         raise ValueError(f"expected (K, M) and (M, M) with M > {neighbours}, got {across.shape} and {real.shape}")
@@ -129,10 +129,10 @@ def coverage(across: jax.Array, real: jax.Array, *, neighbours: int = 5) -> jax.
 
 @jax.jit
 def energy_distance(across: jax.Array, drawn: jax.Array, real: jax.Array) -> jax.Array:
-    """How far two sets of motions are from one distribution, from tables (K, M), (K, K) and (M, M) of `distances`.
+    """Return the energy distance () of two sets of motions, from tables (K, M), (K, K) and (M, M) of `distances`.
 
-    2 E|X - Y| - E|X - X'| - E|Y - Y'|, over the last; 0 for equal distributions. Szekely & Rizzo 2013. Without
-    bias: two samples of one distribution give 0 in the mean, and may give less.
+    (2 E|X - Y| - E|X - X'| - E|Y - Y'|) / E|Y - Y'|; 0 for equal distributions. Szekely & Rizzo 2013. Unbiased: two
+    samples of one distribution give 0 in the mean, and may give a negative value.
     """
     spread = mean_off_diagonal(real)
     return (2 * jnp.mean(across) - mean_off_diagonal(drawn) - spread) / spread
@@ -140,7 +140,7 @@ def energy_distance(across: jax.Array, drawn: jax.Array, real: jax.Array) -> jax
 
 @jax.jit
 def diversity(samples: jax.Array) -> jax.Array:
-    """Mean distance (...) over all pairs of the samples (..., K, T, L, 3), K >= 2."""
+    """Return the mean distance (...) over all pairs of the samples (..., K, T, L, 3), K >= 2."""
     _check_motion(samples, 1, axes=4)
     count = samples.shape[-4]
     if count < 2:
@@ -149,14 +149,14 @@ def diversity(samples: jax.Array) -> jax.Array:
     def to_all(sample: jax.Array) -> jax.Array:
         return jnp.sum(_motion_distance(sample[..., None, :, :, :], samples), axis=-1)
 
-    # One sample at a time against all: K times less memory than the table of differences.
+    # One sample at a time against all others: K times less memory than the table of differences.
     totals = jax.lax.map(to_all, jnp.moveaxis(samples, -4, 0))
     return jnp.sum(totals, axis=0) / (count * (count - 1))
 
 
 @jax.jit(static_argnames=("chunk",))
 def nearest_distance(samples: jax.Array, training: jax.Array, *, chunk: int = 64) -> jax.Array:
-    """Distance (K,) of each sample (K, T, L, 3) to the nearest of the training set (M, T, L, 3).
+    """Return the distance (K,) of each sample (K, T, L, 3) to the nearest of the training set (M, T, L, 3).
 
     Its mean is the specificity of Davies et al. 2002. Differences are formed for `chunk` training motions at
     a time: memory is chunk times that of one motion, whatever K and M.
@@ -179,8 +179,8 @@ def _motion_distance(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def _norm(vectors: jax.Array) -> jax.Array:
-    """The norm over the last axis, with gradient 0 at 0."""
-    return sphere.root(jnp.sum(vectors**2, axis=-1))
+    """Return the norm over the last axis, with gradient 0 at 0."""
+    return sphere.safe_sqrt(jnp.sum(vectors**2, axis=-1))
 
 
 def _check_same(a: jax.Array, b: jax.Array, axes: int) -> None:

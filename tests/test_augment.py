@@ -147,10 +147,10 @@ def test_apex_and_halves_share_the_peak():
     curve = random.normal(size=(4, 3)) + np.linspace(0, 1, 7)[:, None, None] ** 2 * random.normal(size=(4, 3))
     sequence = np.concatenate([curve, curve[-2::-1]])
     assert augment.apex(sequence) == 6
-    rise, fall = augment.halves(sequence, 6, frames=7)
+    rise, fall = augment.split_at_peak(sequence, 6, frames=7)
     np.testing.assert_allclose(rise, curve, atol=1e-6)
     np.testing.assert_allclose(fall, curve[::-1], atol=1e-6)
-    rise, fall = augment.halves(np.stack([sequence, sequence]), np.asarray([6, 12]), frames=30)
+    rise, fall = augment.split_at_peak(np.stack([sequence, sequence]), np.asarray([6, 12]), frames=30)
     np.testing.assert_array_equal(rise[:, -1], sequence[[6, 12]].astype(np.float32))
     np.testing.assert_array_equal(fall[:, 0], rise[:, -1])
     np.testing.assert_array_equal(fall[1], np.broadcast_to(fall[1, 0], fall[1].shape))
@@ -225,7 +225,7 @@ def test_select_on_ties_gives_the_lower_indices():
         (lambda p, k: augment.select(p, k, p, per_pair=1, reuse=0), "got 1 and 0"),
         (lambda p, k: augment.select(p, k, p[:, :3], per_pair=1), "prototypes: expected"),
         (lambda p, k: augment.apex(p[0]), "T, L, 3"),
-        (lambda p, k: augment.halves(p, 1, frames=1), "at least 2, got 1"),
+        (lambda p, k: augment.split_at_peak(p, 1, frames=1), "at least 2, got 1"),
         (lambda p, k: augment.transition(p, 0.0, p, 0.0, p[0], p[0], frames=1), "at least 2, got 1"),
         (lambda p, k: augment.transition(p, 0.0, p, 0.0, p[0], p[0, :2]), "start2: expected"),
     ],
@@ -256,7 +256,7 @@ def test_tau_walks_the_geodesic_and_the_performed_pace_is_the_share_covered():
         share = np.concatenate([[0], np.cumsum(steps) / steps.sum()])
         wanted = augment.transition(*arguments(motions, i, j), jnp.asarray(share), frames=7)
         np.testing.assert_allclose(one, wanted, atol=1e-5)
-    with pytest.raises(ValueError, match="pace: expected one of"):
+    with pytest.raises(ValueError, match="time_warp: expected one of"):
         augment.transitions(motions, pairs, time_warp="slow")
     with pytest.raises(ValueError, match=r"tau: expected \(..., 9\)"):
         augment.transition(*args, jnp.zeros(5), frames=9)
@@ -274,7 +274,7 @@ def test_another_number_of_frames_takes_the_performed_pace_between_its_frames():
 @pytest.mark.parametrize("per_pair", [1, 4, 12, None], ids=str)
 def test_spread_lets_everybody_serve_equally_often(sizes, per_pair):
     labels = np.random.default_rng(0).permutation(np.repeat(np.arange(3), sizes))
-    pairs = augment.spread(labels, classes=3, per_pair=per_pair)
+    pairs = augment.balanced_pairs(labels, classes=3, per_pair=per_pair)
     assert len({tuple(pair) for pair in pairs.tolist()}) == len(pairs)
     for a, b in ((a, b) for a in range(3) for b in range(3) if a != b):
         mine = pairs[(labels[pairs[:, 0]] == a) & (labels[pairs[:, 1]] == b)]
@@ -284,7 +284,7 @@ def test_spread_lets_everybody_serve_equally_often(sizes, per_pair):
             served = np.bincount(mine[:, column], minlength=len(labels))[labels == label]
             assert served.max() - served.min() <= 1
     with pytest.raises(ValueError, match="per_pair: expected at least 1"):
-        augment.spread(labels, classes=3, per_pair=0)
+        augment.balanced_pairs(labels, classes=3, per_pair=0)
 
 
 def test_one_of_each_is_held_out():

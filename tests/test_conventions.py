@@ -2,6 +2,9 @@
 
 import ast
 import inspect
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -9,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from facejax.geometry import align, rbf, sphere, srvf
+from facejax.geometry import align, host, interpolation, rbf, sphere, srvf
 
 ROOT = Path(__file__).resolve().parents[1]
 T, L, K = 6, 4, 3
@@ -44,7 +47,7 @@ def similarity(lead):
 
 # Every public function of the room: its arguments for a batch of the shape `lead`, and its static options.
 CASES = {
-    "sphere.root": (lambda lead: (array(1, *lead) ** 2,), {}),
+    "sphere.safe_sqrt": (lambda lead: (array(1, *lead) ** 2,), {}),
     "sphere.inner": (lambda lead: (point(lead, 1), point(lead, 2)), {}),
     "sphere.norm": (lambda lead: (tangent(lead, 2),), {}),
     "sphere.project": (lambda lead: (point(lead, 1), array(2, *lead, T - 1, L, 3)), {}),
@@ -58,7 +61,7 @@ CASES = {
     "srvf.encode": (lambda lead: (curve(lead),), {}),
     "srvf.decode": (lambda lead: (point(lead, 1), array(2, *lead), array(3, *lead, L, 3)), {}),
     "srvf.displacement": (lambda lead: (point(lead, 1), array(2, *lead)), {}),
-    "srvf.covered": (lambda lead: (point(lead, 1),), {}),
+    "srvf.arc_length_fraction": (lambda lead: (point(lead, 1),), {}),
     "srvf.length": (lambda lead: (curve(lead),), {}),
     "align.centre": (lambda lead: (array(1, *lead, L, 3),), {}),
     "align.normalise": (lambda lead: (curve(lead), array(2, *lead, L, 3)), {}),
@@ -69,9 +72,16 @@ CASES = {
     "align.interpolate": (lambda lead: (curve(lead), 2 * array(2, *lead, 7) ** 2), {}),
     "rbf.warp": (lambda lead: (array(1, *lead, 9, L), array(2, *lead, L, 3)), {}),
 }
-# Functions that work in float64 on the host, once per face, and cannot be jitted.
-HOST = {"rbf.fit", "rbf.weights", "rbf.apply", "rbf.refit"}
-MODULES = {"sphere": sphere, "srvf": srvf, "align": align, "rbf": rbf}
+# Functions that are not jitted: NumPy on the host, or either kind of array.
+HOST = {"rbf.fit", "rbf.weights", "rbf.apply", "rbf.refit", "host.procrustes", "interpolation.smoothstep"}
+MODULES = {
+    "sphere": sphere,
+    "srvf": srvf,
+    "align": align,
+    "rbf": rbf,
+    "host": host,
+    "interpolation": interpolation,
+}
 
 
 def function(name):
@@ -299,3 +309,62 @@ def test_the_check_finds_a_circle(tmp_path):
     for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
         (tmp_path / "facejax" / f"{name}.py").write_text(f"from facejax import {other}\n")
     assert cycle(graph(tmp_path)) == ["facejax.a", "facejax.b", "facejax.c", "facejax.a"]
+
+
+def public_definitions():
+    """(module, definition) of every public function and class at the top level of facejax's modules."""
+    for module, path in modules(ROOT, "facejax").items():
+        for node in ast.parse(path.read_text(encoding="utf-8"), str(path)).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                yield module, node
+
+
+# A docstring begins with a verb in the imperative or with a noun phrase: not with a clause, a preposition or code.
+CLAUSE = re.compile(r"(What|How|Where|When|Whether|Which|Who|Why|The same|As|Of|If|From|With|Without|In|On|For|By)\b|`")
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun_phrase():
+    found = [
+        f"{module}.{node.name}: {(ast.get_docstring(node) or 'no docstring').splitlines()[0]}"
+        for module, node in public_definitions()
+        if not ast.get_docstring(node) or CLAUSE.match(ast.get_docstring(node))
+    ]
+    assert found == [], "\n".join(found)
+
+
+def arguments(node):
+    return [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+
+
+def test_an_axis_of_devices_is_a_device_mesh():
+    """`mesh` is a surface: a parameter of JAX's type Mesh is called `device_mesh`."""
+    found = [
+        f"{module}.{node.name}({argument.arg})"
+        for module, node in public_definitions()
+        if isinstance(node, ast.FunctionDef)
+        for argument in arguments(node)
+        if argument.annotation and re.search(r"\bMesh\b", ast.unparse(argument.annotation))
+        if argument.arg != "device_mesh"
+    ]
+    assert found == []
+
+
+# What may stand before a random key: parameters of models, and functions (optimisers, a critic, a field).
+BEFORE_KEY = {"params", "models", "generator", "starts", "chart", "optimiser", "optimisers", "score", "field"}
+
+
+def test_a_random_key_comes_before_the_data():
+    found = [
+        f"{module}.{node.name}({', '.join(names)})"
+        for module, node in public_definitions()
+        if isinstance(node, ast.FunctionDef)
+        for names in [[argument.arg for argument in (*node.args.posonlyargs, *node.args.args)]]
+        if "key" in names and not set(names[: names.index("key")]) <= BEFORE_KEY
+    ]
+    assert found == []
+
+
+@pytest.mark.parametrize("module", ["facejax", "facejax.data.importers.worker", "facejax.geometry.interpolation"])
+def test_modules_that_read_files_in_processes_of_their_own_import_no_jax(module):
+    code = f"import sys, {module}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0

@@ -106,6 +106,11 @@ def test_links_exist():
                 assert anchor in slugs, f"{page}: {target}"
 
 
+def test_examples_are_listed():
+    named = set(re.findall(r"^\| `(\w+\.py)` \|", PAGES["docs/quickstart.md"], re.MULTILINE))
+    assert named == {path.name for path in (ROOT / "examples").glob("*.py")}
+
+
 def test_modules_of_experiments_and_benchmarks_exist():
     for page, text in PAGES.items():
         for room, name in set(re.findall(r"python -m (experiments|benchmarks)\.([a-z]\w+)", text)):

@@ -189,7 +189,7 @@ def test_walks_are_those_of_the_library_and_takes_those_of_the_dataset(own_cache
         (theirs,) = motions.interpolated_transitions(
             onsets, len(data.labels), per_pair=1, choice="spread", time_warp=pace
         )
-        pairs = augment.spread(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
+        pairs = augment.balanced_pairs(onsets.end - 1, classes=len(data.labels) - 1, per_pair=1)
         mine = _interpolation_eval.peak_transitions(
             *(onsets.curves[side] for side in pairs.T), path="sphere", pace=pace
         )

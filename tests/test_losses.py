@@ -85,17 +85,17 @@ def test_landmark_weights_are_the_plain_loop(mode):
 
 
 def test_wrong_shapes_and_options_are_named():
-    with pytest.raises(ValueError, match=r"one shape; got \(7, 3\) and \(6, 3\)"):
+    with pytest.raises(ValueError, match=r"expected equal shapes, got \(7, 3\) and \(6, 3\)"):
         losses.displacement_l1(jnp.zeros((7, 3)), jnp.zeros((6, 3)))
-    with pytest.raises(ValueError, match=r"weights must have shape \(7,\), one per vertex; got \(6,\)"):
+    with pytest.raises(ValueError, match=r"weights: expected shape \(7,\), one per vertex, got \(6,\)"):
         losses.weighted_l1(jnp.zeros((7, 3)), jnp.zeros((7, 3)), jnp.zeros(6))
-    with pytest.raises(ValueError, match="reduction must be 'paper' or 'reference'; got 'sum'"):
+    with pytest.raises(ValueError, match="reduction: expected 'paper' or 'reference', got 'sum'"):
         losses.s2d(PREDICTED, TARGET, WEIGHTS, reduction="sum")
-    with pytest.raises(ValueError, match=r"mode must be .*; got 'square'"):
+    with pytest.raises(ValueError, match=r"mode: expected .*, got 'square'"):
         losses.landmark_weights(jnp.zeros((7, 3)), jnp.arange(2), mode="square")
     with pytest.raises(ValueError, match="needs edge_length"):
         losses.landmark_weights(jnp.zeros((7, 3)), jnp.arange(2), mode="inverse")
-    with pytest.raises(ValueError, match=r"vertices must have shape \(N, 3\); got \(7, 2\)"):
+    with pytest.raises(ValueError, match=r"vertices: expected shape \(N, 3\), got \(7, 2\)"):
         losses.landmark_weights(jnp.zeros((7, 2)), jnp.arange(2))
 
 
@@ -248,13 +248,13 @@ def naive_path(predicted, target, mask):
     return np.mean(rows)
 
 
-@pytest.mark.parametrize(("loss", "naive"), [(losses.next_step, naive_next_step), (losses.path, naive_path)])
+@pytest.mark.parametrize(("loss", "naive"), [(losses.next_step, naive_next_step), (losses.path_distance, naive_path)])
 def test_losses_of_steps_are_the_loops(loss, naive):
     a, b = np.asarray(steps_of(1, 3), np.float64), np.asarray(steps_of(2, 3), np.float64)
     np.testing.assert_allclose(loss(steps_of(1, 3), steps_of(2, 3), jnp.asarray(MASK)), naive(a, b, MASK), rtol=1e-5)
 
 
-@pytest.mark.parametrize("loss", [losses.next_step, losses.path])
+@pytest.mark.parametrize("loss", [losses.next_step, losses.path_distance])
 def test_what_is_masked_changes_nothing_and_the_truth_costs_nothing(loss):
     a, b, mask = steps_of(1, 3), steps_of(2, 3), jnp.asarray(MASK)
     changed = jnp.where(mask[..., None, None], a, 100.0)
@@ -263,7 +263,7 @@ def test_what_is_masked_changes_nothing_and_the_truth_costs_nothing(loss):
     assert float(loss(a, b, jnp.zeros_like(mask))) == 0
     slope = jax.grad(loss)(a, a, mask)
     assert np.isfinite(slope).all() and not np.asarray(slope).any()
-    with pytest.raises(ValueError, match="mask must have shape"):
+    with pytest.raises(ValueError, match="mask: expected shape"):
         loss(a, b, mask[:, :5])
 
 
@@ -271,7 +271,7 @@ def test_the_best_path_is_the_median_where_the_mean_is_nobodys():
     """Two thirds go one way, one third the other: distance wants the way of the many, its square would not."""
     targets = jnp.asarray(np.array([1.0, 1.0, -1.0])[:, None, None, None] * np.ones((3, 6, 1, 3)), jnp.float32)
     mask = jnp.ones((3, 6), bool)
-    costs = [float(losses.path(jnp.full_like(targets, x), targets, mask)) for x in (1.0, 1 / 3, 0.0, -1.0)]
+    costs = [float(losses.path_distance(jnp.full_like(targets, x), targets, mask)) for x in (1.0, 1 / 3, 0.0, -1.0)]
     assert costs == sorted(costs)
 
 
@@ -281,12 +281,12 @@ def test_strength_and_energy():
     second = [
         np.mean(np.square(a[k, t + 1] - a[k, t])) for k in range(3) for t in range(5) if MASK[k, t] and MASK[k, t + 1]
     ]
-    wanted = losses.strength(a, mask)
+    wanted = losses.step_energy(a, mask)
     np.testing.assert_allclose(wanted, [np.mean(first), np.mean(second)], rtol=1e-5)
-    assert float(losses.energy(a, mask, wanted)) == pytest.approx(0, abs=1e-10)
-    assert float(losses.energy(-a, mask, wanted)) == pytest.approx(0, abs=1e-10)  # whatever its direction
-    assert float(losses.energy(0.5 * a, mask, wanted)) == pytest.approx(0.5, rel=1e-5)  # (1/2 - 1)^2, twice
-    assert float(losses.energy(a, jnp.zeros_like(mask), wanted)) == 0
-    slope = jax.grad(losses.energy)(jnp.zeros_like(a), mask, wanted)
+    assert float(losses.energy_ratio(a, mask, wanted)) == pytest.approx(0, abs=1e-10)
+    assert float(losses.energy_ratio(-a, mask, wanted)) == pytest.approx(0, abs=1e-10)  # whatever its direction
+    assert float(losses.energy_ratio(0.5 * a, mask, wanted)) == pytest.approx(0.5, rel=1e-5)  # (1/2 - 1)^2, twice
+    assert float(losses.energy_ratio(a, jnp.zeros_like(mask), wanted)) == 0
+    slope = jax.grad(losses.energy_ratio)(jnp.zeros_like(a), mask, wanted)
     assert np.isfinite(slope).all()
-    check_grads(lambda x: losses.energy(x, mask, wanted), (0.7 * a,), order=1, atol=1e-2, rtol=1e-2)
+    check_grads(lambda x: losses.energy_ratio(x, mask, wanted), (0.7 * a,), order=1, atol=1e-2, rtol=1e-2)

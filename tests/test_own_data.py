@@ -155,7 +155,7 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
     rows = table2.run(table2.Config(data=own, speech=own, **options))["rows"]
     errors = {(row["method"], row["region"]): row for row in rows}
     assert errors["rbf", "face"]["own_mm"] < errors["still", "face"]["own_mm"]
-    with pytest.raises(ValueError, match="--recording moves people of makehuman4d"):
+    with pytest.raises(ValueError, match="--recording animates people of makehuman4d"):
         table2.run(table2.Config(data=own, recording=tmp_path / "take.csv", **options))
     with pytest.raises(ValueError, match=r"expected --recording .*, or --speech"):
         table2.run(table2.Config(data=own, **options))
@@ -164,7 +164,7 @@ def test_motion_carried_between_people(tiny, own, model, tmp_path):  # noqa: F81
     assert all(0 < row["mean_mm"] < 3 * row["still_mm"] for row in found["transfer"])
     with pytest.raises(ValueError, match="name one of them"):
         figure9.run(figure9.Config(out=tmp_path / "b", data=own, model=model, recording=tmp_path / "take.csv"))
-    with pytest.raises(ValueError, match="made of another dataset than makehuman4d: name it with --data"):
+    with pytest.raises(ValueError, match="trained on another dataset than makehuman4d: give that dataset with --data"):
         figure9.run(figure9.Config(out=tmp_path / "b", model=model))
     with pytest.raises(ValueError, match="--people: expected three of"):
         figure9.run(figure9.Config(out=tmp_path / "b", data=own, model=model, people=(1, 2, 99)))
@@ -186,5 +186,5 @@ def test_a_take_is_carried_onto_itself_and_stretched(own):
 
 
 def test_what_only_makehuman4d_has(own_cache, own, tmp_path):  # noqa: F811
-    with pytest.raises(ValueError, match="only makehuman4d has transitions that were performed from peak to peak"):
+    with pytest.raises(ValueError, match="only makehuman4d contains directly performed peak-to-peak transitions"):
         interpolation.run(interpolation.Config(out=tmp_path / "o", data=own))

@@ -22,13 +22,13 @@ def motions(dtype):
 
 def test_losses_of_steps(dtype):
     first, second, mask = motions(dtype)
-    for loss in (losses.next_step, losses.path):
+    for loss in (losses.next_step, losses.path_distance):
         each = finite(lambda a, b, loss=loss: jax.vmap(loss)(a, b, mask), first, second)
         assert (np.asarray(each) >= 0).all() and (np.asarray(loss(first, first, mask)) == 0).all()
-    wanted = losses.strength(second, mask)
-    finite(lambda a: jax.vmap(losses.strength)(a, mask), first)
-    finite(lambda a: losses.energy(a, mask, wanted), first, each=False)
-    finite(lambda a: losses.energy(a, mask, wanted), jnp.zeros_like(first), each=False)
+    wanted = losses.step_energy(second, mask)
+    finite(lambda a: jax.vmap(losses.step_energy)(a, mask), first)
+    finite(lambda a: losses.energy_ratio(a, mask, wanted), first, each=False)
+    finite(lambda a: losses.energy_ratio(a, mask, wanted), jnp.zeros_like(first), each=False)
     for loss in (losses.tangent_l1, losses.displacement_l1):
         assert (np.asarray(finite(jax.vmap(loss), first, second)) >= 0).all()
 

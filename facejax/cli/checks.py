@@ -17,6 +17,7 @@ from facejax.inference import checks
 
 MAX_PEOPLE = 1000  # of a corpus, or of sample faces
 MAX_FRAMES = 100_000  # of all samples together
+MAX_NOISE_MM = 2.0  # `data.synthetic.noise.MAX_SIGMA_MM`
 MESHES = (".ply", ".obj", ".glb", ".npz", ".npy")
 LANDMARKS = (".json", ".pp", ".txt", ".csv", ".xyz", ".lnd", ".bnd", ".npy", ".npz", ".pkl")
 KERNELS = ("gaussian", "multiquadric", "thin_plate", "triharmonic", "wendland_c2")  # of `geometry.rbf`
@@ -186,10 +187,8 @@ def _register(command: Register) -> None:
 def _makehuman(command: MakeHuman) -> None:
     if command.sample is not None and not 1 <= command.count <= MAX_PEOPLE:
         raise ValueError(f"--count must lie in 1..{MAX_PEOPLE}, got {command.count}")
-    if command.noise:
-        from facejax.data.synthetic import noise
-
-        noise.check(command.noise)
+    if not 0 <= command.noise <= MAX_NOISE_MM:
+        raise ValueError(f"--noise must lie in 0..{MAX_NOISE_MM:g} mm, got {command.noise}")
     for folder in (command.sample, command.out):
         if folder is not None:
             check_output_folder(folder)

@@ -54,7 +54,7 @@ def fit(
     if jax.process_count() == 1:  # the batch size must be a multiple of the number of devices
         count = math.gcd(count, plans.motion.batch, plans.residual.batch)
     device_mesh = sharding.data_mesh(jax.devices()[:count]) if count > 1 else None
-    models = fit_bundle.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, mesh=device_mesh)
+    models = fit_bundle.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, device_mesh=device_mesh)
     errors = vertex_error.model_errors(models, found)
     if sharding.is_primary():
         pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))

@@ -18,7 +18,7 @@ import tyro
 import facejax
 from facejax.cli import checks
 from facejax.cli.arguments import Animate, Command, Data, Demo, Fit, Generate, Labels, Register, View
-from facejax.io import atomic
+from facejax.io import errors
 
 DESCRIPTION = (
     "4D facial expressions: animate faces, prepare datasets, train models. `facejax --version` prints the version."
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except (ValueError, RuntimeError, OSError, MemoryError, OverflowError) as error:
-        print(f"facejax: {atomic.one_line(_message(error, command))}", file=sys.stderr)
+        print(f"facejax: {errors.one_line(_message(error, command))}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from facejax import io
 from facejax.inference import pipeline
-from facejax.io import atomic
+from facejax.io import atomic, errors
 from facejax.viz import eyes_teeth, video
 from facejax.viz import scene as viz_scene
 from facejax.viz.scene import Scene
@@ -44,7 +44,7 @@ def make_output_folder(folder: Path) -> None:
 def report(files: Sequence[Path], notes: Sequence[str] = ()) -> None:
     """Print notes on what was assumed to standard error, and the paths of files to standard output."""
     for note in notes:
-        print(atomic.one_line(note), file=sys.stderr)
+        print(errors.one_line(note), file=sys.stderr)
     print("\n".join(str(path) for path in files))
 
 

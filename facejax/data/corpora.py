@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from facejax.io import atomic, npz
+from facejax.io import atomic, errors, npz
 
 SCHEMA = 1
 MAX_INDEX_BYTES = 3 << 23
@@ -34,7 +34,7 @@ class Shard(NamedTuple):
     sha256: str
 
 
-class CorpusError(atomic.FileError):
+class CorpusError(errors.FileError):
     """A corpus is missing, incomplete or damaged."""
 
 

@@ -19,14 +19,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from facejax.io import atomic
+from facejax.io import errors
 
 SCHEMA = 1
 MAX_INDEX_BYTES = 3 * 2**23  # parsed JSON takes up to thirty times as much memory
 SPLITS = ("train", "validation", "test")
 
 
-class DatasetError(atomic.FileError):
+class DatasetError(errors.FileError):
     """A dataset is missing, incomplete or of another schema."""
 
 

@@ -77,8 +77,9 @@ class MeshSubset:
         return self.owner if by == "subjects" else self.labels
 
     def folds(self, count: int, *, by: str = "subjects") -> list[tuple[MeshSubset, MeshSubset]]:
-        """Split for cross-validation: (fit, held out) for each of `count` groups of subjects, or labels, in sorted order.
+        """Split for cross-validation: (fit, held out) for each of `count` groups of subjects, or of labels.
 
+        Groups are formed in sorted order.
         With fewer subjects (or labels) than `count`, each forms its own fold.
 
         Raises:

@@ -123,7 +123,7 @@ def interpolated_transitions(
     q, log_length = srvf.encode(jnp.asarray(onsets.curves))
     motions = augment.Motions(q, log_length, jnp.asarray(onsets.curves[:, 0]))
     if choice == "spread":
-        chosen = augment.spread(onsets.end - 1, classes=labels - 1, per_pair=per_pair, seed=seed)
+        chosen = augment.balanced_pairs(onsets.end - 1, classes=labels - 1, per_pair=per_pair, seed=seed)
     else:
         peaks = onsets.curves[:, -1]
         prototypes = np.zeros((labels, *peaks.shape[1:]))

@@ -95,7 +95,7 @@ def fit_chart(
         raise ValueError(f'mean: expected "karcher" or "extrinsic", got {mean!r}')
     q, log_length = srvf.encode(jnp.asarray(known.curves))
     p = sphere.karcher_mean(q) if mean == "karcher" else sphere.extrinsic_mean(q)
-    motion = tangent_pca.Motion(None, np.asarray(log_length), np.log(known.seconds))
+    motion = tangent_pca.Motion(q, np.asarray(log_length), np.log(known.seconds))  # pyright: ignore
     return tangent_pca.fit(
         np.asarray(p), np.asarray(sphere.log(p, q)), motion, known.start, known.end, known.curves[:, 0],
         labels=labels, rank=rank, pose=pose,

@@ -1,26 +1,28 @@
-"""Every way from landmarks to a mesh behind one interface, to be compared or swapped.
+"""Decoders from landmarks to a mesh behind one interface, to be compared or exchanged.
 
-    method = methods.METHODS["ridge"]
+    method = baselines.METHODS["ridge"]
     params = method.fit(train, folder, options)
     vertices = method.apply(params, landmark_displacements, neutral)
 
-`train` is a selection of meshes (`facejax.data.meshes`); `folder` keeps checkpoints of what is trained step by step,
-which goes on from there when called again. `apply` takes the displacements (T, L, 3) of one face and that face at rest
-(N, 3), in mm, and gives its vertices (T, N, 3).
+`train` is a selection of meshes (`facejax.data.mesh_subset`); `folder` keeps checkpoints of iterative training, which
+resumes from them. `apply` maps displacements (T, L, 3) of one face and that face at rest (N, 3), in mm, to vertices
+(T, N, 3).
 
-s2d            S2D-Dec (Otberdout et al. 2023)
-s2d_residual   the best linear answer, refined by a spiral decoder that sees the face; `gpmm` is that answer alone
-ridge          ridge regression, the bar that tables leave out
-pca38, pca220  3DMM of so many principal components of displacements: the paper's expression-specific one
-pca220_mean    the paper's common 3DMM: components of whole meshes about their overall mean
+s2d            S2D-Dec (OT23)
+s2d_residual   GPMM estimate plus residual decoder (spiral convolutions on the face); `gpmm` is the estimate alone
+gpmm_found     GPMM estimate with landmark noise sigma (mm) estimated from the landmarks
+ridge          ridge regression, a baseline that published tables lack
+pca38, pca220  3DMM of so many principal components of displacements: OT23's expression-specific one
+pca220_mean    OT23's common 3DMM: principal components of whole meshes about their overall mean
 dl3dmm         dictionary-learning 3DMM, 220 atoms
-neural3dmm     spiral autoencoder of the neutral face with the landmarks beside its code
-rbf            radial basis functions: no training at all
-still          the neutral face, unmoved
+neural3dmm     spiral autoencoder of the neutral face, with the landmarks beside its code
+rbf            radial basis functions, without training
+still          the neutral face
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,34 +39,34 @@ from facejax.training.recipes import fit_gpmm, fit_linear, fit_neural3dmm, fit_r
 
 
 class Options(NamedTuple):
-    """What a comparison holds fixed."""
+    """Settings that a comparison holds fixed."""
 
-    by: str = "subjects"  # what will be new at test time, "subjects" or "labels": cross-validation holds it out
+    by: str = "subjects"  # or "labels": what is unseen at test time; cross-validation holds it out
     seed: int = 0
     decoder: fit_s2d_dec.S2DDecPlan = fit_s2d_dec.S2DDecPlan()
     residual: fit_residual.ResidualPlan = fit_residual.ResidualPlan()
     neural3dmm: fit_neural3dmm.Neural3DMMPlan = fit_neural3dmm.Neural3DMMPlan()
     components: int = gpmm.COMPONENTS
-    base: fit_gpmm.FittedGPMM | None = None  # of the residual decoder, where it is known already
-    hierarchy: mesh_hierarchy.Hierarchy | None = None  # of the spiral networks; by default made of the mean face
+    base: fit_gpmm.FittedGPMM | None = None  # of the residual decoder, if it has been fitted already
+    hierarchy: mesh_hierarchy.Hierarchy | None = None  # of the spiral networks; default: built from the mean face
 
 
 class Method(NamedTuple):
-    """A way from landmarks to a mesh."""
+    """A decoder: how it is fitted, and how it is applied."""
 
     fit: Callable[[MeshSubset, Path, Options], Any]
     apply: Callable[[Any, np.ndarray, np.ndarray], np.ndarray]  # displacements (T, L, 3), neutral (N, 3) -> (T, N, 3)
 
 
 class LinearFit(NamedTuple):
-    """A linear map, and the weight of its prior that cross-validation chose."""
+    """A linear map, and the ridge weight that cross-validation selected."""
 
     params: linear.LinearMap
     alpha: float  # mm^2
 
 
 class StaticTopology(NamedTuple):
-    """What methods that learn nothing know."""
+    """What methods without training need."""
 
     faces: np.ndarray
     landmark_index: np.ndarray
@@ -96,8 +98,9 @@ def _fit_dictionary(train: MeshSubset, folder: Path, options: Options) -> Linear
     return LinearFit(*found)
 
 
-class _Whole(NamedTuple):
-    """Meshes with their people's faces still in them, as displacements from the mean of all faces."""
+@dataclasses.dataclass(frozen=True)
+class _WholeMeshes:
+    """Meshes that include the identity, as displacements from the mean of all faces."""
 
     meshes: MeshSubset
 
@@ -106,16 +109,16 @@ class _Whole(NamedTuple):
         mean = np.asarray(rest[self.meshes.subjects]).mean(axis=0)
         for low in range(0, self.meshes.count, self.meshes.size):
             rows = np.arange(low, min(low + self.meshes.size, self.meshes.count))
-            off = self.meshes.read(rows)[1] + rest[self.meshes.owner[rows]] - mean
-            yield off[:, at], off
+            displacements = self.meshes.read(rows)[1] + rest[self.meshes.owner[rows]] - mean
+            yield displacements[:, at], displacements
 
 
-def _fit_whole(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
+def _fit_common_pca(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
     def prepare(batches, **_):
-        return linear.pca.prepare(_Whole(batches), components=220)
+        return linear.pca.prepare(_WholeMeshes(batches), components=220)
 
     def solve(basis, *, alpha):
-        # The components move a face away from where it is, whatever the mean: displacements have no mean here.
+        # The components are applied to displacements from the neutral face, which have no mean here.
         at_rest = basis._replace(
             landmark_mean=np.zeros_like(basis.landmark_mean), vertex_mean=np.zeros_like(basis.vertex_mean)
         )
@@ -142,7 +145,7 @@ def _apply_gpmm(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral:
     return neutral + np.asarray(linear.apply(gpmm.linear_map(fitted.params, neutral), displacements))
 
 
-def _apply_doubting(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_gpmm_with_noise(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     params = gpmm.with_landmark_noise(
         fitted.params, gpmm.estimate_landmark_noise(fitted.params, neutral, displacements)
     )
@@ -170,18 +173,18 @@ def _apply_neural(
     return neutral + fit_neural3dmm.apply(fitted, displacements, neutral)
 
 
-def _rest(train: MeshSubset, folder: Path, options: Options) -> StaticTopology:
+def _fit_static(train: MeshSubset, folder: Path, options: Options) -> StaticTopology:
     return StaticTopology(np.asarray(train.data.faces), np.asarray(train.data.landmark_index))
 
 
-def _apply_rbf(known: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    points = np.asarray(neutral, np.float64)[known.landmark_index]
+def _apply_rbf(fitted: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    points = np.asarray(neutral, np.float64)[fitted.landmark_index]
     lips = rbf_weights.IBUG_LIPS if len(points) == 68 else None
-    weights = rbf_weights.weights(np.asarray(neutral, np.float64), known.faces, points, lips=lips)
+    weights = rbf_weights.weights(np.asarray(neutral, np.float64), fitted.faces, points, lips=lips)
     return neutral + np.asarray(rbf.warp(weights, displacements))
 
 
-def _apply_still(known: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_neutral(fitted: StaticTopology, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     return np.broadcast_to(neutral, (len(displacements), *np.shape(neutral)))
 
 
@@ -189,13 +192,13 @@ METHODS = {
     "s2d": Method(_fit_s2d, _apply_s2d),
     "s2d_residual": Method(_fit_residual, _apply_residual),
     "gpmm": Method(_fit_gpmm, _apply_gpmm),
-    "gpmm_found": Method(_fit_gpmm, _apply_doubting),
+    "gpmm_found": Method(_fit_gpmm, _apply_gpmm_with_noise),
     "ridge": _linear(linear.ridge),
     "pca38": _linear(linear.pca, components=38),
     "pca220": _linear(linear.pca, components=220),
-    "pca220_mean": Method(_fit_whole, _apply_linear),
+    "pca220_mean": Method(_fit_common_pca, _apply_linear),
     "dl3dmm": Method(_fit_dictionary, _apply_linear),
     "neural3dmm": Method(_fit_neural, _apply_neural),
-    "rbf": Method(_rest, _apply_rbf),
-    "still": Method(_rest, _apply_still),
+    "rbf": Method(_fit_static, _apply_rbf),
+    "still": Method(_fit_static, _apply_neutral),
 }

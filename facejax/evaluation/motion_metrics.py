@@ -7,6 +7,7 @@ distance of two curves is the Euclidean distance per landmark, averaged over lan
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,9 +64,9 @@ def pair_scores(
     return rows
 
 
-def mean_scores(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+def mean_scores(rows: Sequence[dict[str, float]]) -> dict[str, Any]:
     """Return the mean of each score over pairs, and the ranges of the diversity and acceleration ratios."""
-    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    means: dict[str, Any] = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     for name in ("diversity_ratio", "acceleration_ratio"):
         values = [row[name] for row in rows]
         means[f"{name}_range"] = [min(values), max(values)]

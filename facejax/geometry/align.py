@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax.geometry.sphere import root
+from facejax.geometry.sphere import safe_sqrt
 
 
 class Similarity(NamedTuple):
@@ -24,7 +24,7 @@ class Similarity(NamedTuple):
 
 @jax.jit
 def centre(points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Points (..., K, 3) -> the points about their centroid (..., K, 3), and the centroid (..., 3)."""
+    """Return points (..., K, 3) minus their centroid, and the centroid (..., 3)."""
     _check_points(points, "points")
     centroid = jnp.mean(points, axis=-2)
     return points - centroid[..., None, :], centroid
@@ -32,12 +32,14 @@ def centre(points: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @jax.jit
 def normalise(landmarks: jax.Array, neutral: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Curve (..., T, L, 3), neutral landmarks (..., L, 3) of its subject -> unitless curve, scale, centroid.
+    """Normalise a curve (..., T, L, 3) by the neutral landmarks (..., L, 3) of its subject.
 
-    The curve minus the centroid (..., 3) of the *neutral* landmarks, divided by their centred Frobenius norm,
-    the scale (...). One centroid and one scale hold for all frames and all sequences of a subject: those of
-    each frame would let an open jaw shrink the head. Neutral landmarks that are one single point have scale
-    1.
+    Subtracts the centroid (..., 3) of the *neutral* landmarks and divides by their centred Frobenius norm, the scale
+    (...). One centroid and one scale serve all frames and sequences of a subject: with those of each frame an open jaw
+    would shrink the head. Neutral landmarks that all coincide have scale 1.
+
+    Returns:
+      the unitless curve (..., T, L, 3), scale (...), centroid (..., 3).
     """
     _check_curve(landmarks, 1)
     _check_points(neutral, "neutral", landmarks.shape[-2])
@@ -49,18 +51,18 @@ def normalise(landmarks: jax.Array, neutral: jax.Array) -> tuple[jax.Array, jax.
 
 @jax.jit
 def denormalise(unitless: jax.Array, scale: jax.Array, centroid: jax.Array) -> jax.Array:
-    """The inverse of `normalise`: unitless (..., T, L, 3), scale (...), centroid (..., 3) -> the curve."""
+    """Invert `normalise`: return the curve of unitless (..., T, L, 3), scale (...) and centroid (..., 3)."""
     _check_curve(unitless, 1)
     return unitless * jnp.asarray(scale)[..., None, None, None] + jnp.asarray(centroid)[..., None, None, :]
 
 
 @jax.jit(static_argnames=("scaling",))
 def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -> Similarity:
-    """The rotation, translation and, with `scaling`, scale that bring source (..., K, 3) nearest to target.
+    """Fit the rotation, translation and, with `scaling`, scale that align source (..., K, 3) with target (..., K, 3).
 
-    Least squares over the K points, never a reflection (Kabsch 1976; scale after Umeyama 1991). Gradients are
-    exact, with equal singular values too; where the best rotation is not unique (points on one line, or a
-    mirror image with a symmetry) one of them is returned, with gradient 0.
+    Least squares over the K points, never a reflection (Kabsch 1976; scale after Umeyama 1991). Gradients are exact,
+    also with equal singular values. Where the best rotation is not unique (collinear points, or a mirror image with a
+    symmetry) one of them is returned, with gradient 0. `facejax.geometry.host.procrustes` is the NumPy form.
     """
     _check_points(source, "source")
     _check_points(target, "target", source.shape[-2])
@@ -79,7 +81,7 @@ def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -
 
 @jax.jit
 def apply(similarity: Similarity, points: jax.Array) -> jax.Array:
-    """The points (..., K, 3) moved by a similarity."""
+    """Apply a similarity to points (..., K, 3)."""
     _check_points(points, "points")
     turned = jnp.einsum("...ij,...kj->...ki", similarity.rotation, points)
     return similarity.scale[..., None, None] * turned + similarity.translation[..., None, :]
@@ -87,12 +89,11 @@ def apply(similarity: Similarity, points: jax.Array) -> jax.Array:
 
 @jax.jit(static_argnames=("frames", "by"))
 def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
-    """The curve (..., T, L, 3) read at `frames` places, linearly interpolated: (..., frames, L, 3).
+    """Resample a curve (..., T, L, 3) to (..., frames, L, 3) by linear interpolation.
 
-    by="time": evenly spaced in time, which keeps the timing of onset and apex. by="arc": evenly spaced along
-    the curve, which makes the speed constant. First and last frame are kept exactly; a curve that stands
-    still stays as it is. Where a place falls on a frame, the gradient of "arc" is that of one of the two
-    neighbouring segments.
+    by="time": evenly spaced in time, which keeps the timing of onset and apex. by="arc": evenly spaced in arc length,
+    which makes the speed constant. First and last frame are kept exactly; a constant curve is unchanged. Where a
+    position falls on a frame, the gradient of "arc" is that of one of the two neighbouring segments.
     """
     _check_curve(curve, 2)
     if frames < 2:
@@ -104,12 +105,12 @@ def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
     if by != "arc":
         raise ValueError(f'by: expected "time" or "arc", got {by!r}')
     flat = curve.reshape(*curve.shape[:-2], -1)
-    steps = root(jnp.sum(_unit(jnp.diff(flat, axis=-2))[0] ** 2, axis=-1))
+    steps = safe_sqrt(jnp.sum(_unit(jnp.diff(flat, axis=-2))[0] ** 2, axis=-1))
     covered = jnp.concatenate([jnp.zeros_like(steps[..., :1]), jnp.cumsum(steps, axis=-1)], axis=-1)
     wanted = covered[..., -1:] * jnp.linspace(0, 1, frames, dtype=curve.dtype)
-    # The last frame that is not beyond the place: the segment after it has a length, except at the very end.
+    # The last frame not beyond the position: the segment after it has a length, except at the end of the curve.
     index = jnp.sum(covered[..., None, :] <= wanted[..., :, None], axis=-1) - 1
-    # The ends are kept, also where steps are too short to count.
+    # The ends are kept exactly, also where steps are below rounding.
     index = index.at[..., 0].set(0).at[..., -1].set(curve.shape[-3] - 1)
     before = jnp.take_along_axis(covered, index, axis=-1)
     after = jnp.take_along_axis(covered, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-1)
@@ -118,29 +119,29 @@ def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
 
 
 @jax.jit
-def interpolate(curve: jax.Array, places: jax.Array) -> jax.Array:
-    """The curve (..., T, L, 3) read at places (..., F), in frames and clipped to [0, T-1]: (..., F, L, 3)."""
+def interpolate(curve: jax.Array, positions: jax.Array) -> jax.Array:
+    """Interpolate a curve (..., T, L, 3) at positions (..., F), in frames, clipped to [0, T-1]: (..., F, L, 3)."""
     _check_curve(curve, 1)
-    places = jnp.clip(jnp.asarray(places, curve.dtype), 0, curve.shape[-3] - 1)
-    index = jnp.floor(places)
-    return _read(curve, index.astype(jnp.int32), places - index)
+    positions = jnp.clip(jnp.asarray(positions, curve.dtype), 0, curve.shape[-3] - 1)
+    index = jnp.floor(positions)
+    return _read(curve, index.astype(jnp.int32), positions - index)
 
 
 def _read(curve: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
-    """curve[index] + weight * (curve[index + 1] - curve[index]) for index and weight (..., F)."""
+    """Return curve[index] + weight * (curve[index + 1] - curve[index]) for index and weight (..., F)."""
     lead = jnp.broadcast_shapes(curve.shape[:-3], index.shape[:-1])
     curve = jnp.broadcast_to(curve, lead + curve.shape[-3:])
     index, weight = (jnp.broadcast_to(x, lead + x.shape[-1:])[..., None, None] for x in (index, weight))
-    here = jnp.take_along_axis(curve, index, axis=-3)
-    there = jnp.take_along_axis(curve, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-3)
-    # This form, unlike (1 - w) a + w b, gives a back where a = b: standing still survives rounding.
-    return here + weight * (there - here)
+    before = jnp.take_along_axis(curve, index, axis=-3)
+    after = jnp.take_along_axis(curve, jnp.minimum(index + 1, curve.shape[-3] - 1), axis=-3)
+    # Unlike (1 - w) a + w b, this form returns a exactly where a = b: a constant curve stays constant.
+    return before + weight * (after - before)
 
 
 def _unit(points: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Arrays (..., K, D) divided by their largest entry (...), held constant: no square leaves the range of the dtype.
+    """Divide arrays (..., K, D) by their largest entry (...), held constant: no square overflows or underflows.
 
-    What does not depend on the size, or is proportional to it, has the same values and gradients.
+    Functions that are independent of the size, or proportional to it, keep their values and gradients.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(points), axis=(-2, -1)))
     size = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
@@ -149,7 +150,7 @@ def _unit(points: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @jax.custom_jvp
 def _rotation(matrix: jax.Array) -> jax.Array:
-    """The rotation R (..., 3, 3) of greatest trace(R' M) for M (..., 3, 3)."""
+    """Return the rotation R (..., 3, 3) that maximises trace(R' M) for M (..., 3, 3)."""
     u, _, vt = jnp.linalg.svd(matrix)
     handed = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
     flip = jnp.stack([jnp.ones_like(handed), jnp.ones_like(handed), handed], axis=-1)

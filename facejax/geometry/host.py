@@ -1,4 +1,4 @@
-"""Geometry in NumPy, for code outside jit. Imports no JAX, so that worker processes which only read files start fast."""
+"""Geometry in NumPy, for code outside jit. Imports no JAX, so that worker processes that only read files start fast."""
 
 from __future__ import annotations
 

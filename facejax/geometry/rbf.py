@@ -1,4 +1,4 @@
-"""Radial basis functions: the motion of a few landmarks carried to every vertex of any mesh.
+"""Radial basis function interpolation: the motion of a few landmarks extended to every vertex of a mesh.
 
 Glossary
     L, N, T   landmarks, vertices, frames; lengths are in the unit of the input.
@@ -14,13 +14,13 @@ The landmarks' own displacements d give q and p (Seo & Luo 2021, equations 3 and
     | P'                  0 | | a | = | 0 |      P = [1, c],  p(v) = [1, v] a
 
 The paper prints its Gaussian without the square, exp(-r / 2 sigma^2), and its system without p. With the square the
-surface has no spike at a landmark; with p and P'q = 0 an affine motion of the landmarks is carried on exactly.
+surface has no spike at a landmark; with p and P'q = 0 an affine motion of the landmarks is reproduced exactly.
 
-The system depends on the rest alone: it is solved once per face, and all frames become one product. Kept for it are
-not the coefficients q, which grow by thousands where kernels overlap, but how far each landmark's displacement moves
-each vertex, [phi(v), 1, v] times the inverse: numbers of about 1, for which float32 is enough. They are made in float64
-on the host, the system by LAPACK, what grows with the mesh by XLA: NumPy's products have threads of their own, which
-spin on for a while and then hold up JAX's (10,000 vertices: 1 ms instead of 6).
+The system depends on the rest pose alone: it is solved once per face, and all frames become one matrix product. Stored
+are not the coefficients q, which grow by thousands where kernels overlap, but the weights of the landmarks'
+displacements at each vertex, [phi(v), 1, v] times the inverse: numbers of about 1, for which float32 is enough. They
+are computed in float64 on the host, the system by LAPACK, the part that grows with the mesh by XLA: the threads of
+NumPy's products keep spinning for a while and delay JAX's (10,000 vertices: 1 ms instead of 6).
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from scipy.linalg import lapack
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-COINCIDENT = 1e-6  # of the landmarks' extent: nearer ones are one point, flatter ones a plane
-EXACT = 1e-6  # the part of its displacement by which the solved system may miss a landmark
+COINCIDENT = 1e-6  # of the landmarks' extent: nearer landmarks coincide, flatter sets are coplanar
+EXACT = 1e-6  # largest error of the solved system at a landmark, as a fraction of the displacement
 
 
 class Kernel(NamedTuple):
-    """A radial function of r squared, by NumPy or jax.numpy; its usual sigma; whether it can do without p."""
+    """A radial function of r squared (by NumPy or jax.numpy), its default sigma, and whether p may be left out."""
 
     phi: Callable[[ModuleType, Any], Any]
     sigma: float
@@ -50,13 +50,13 @@ class Kernel(NamedTuple):
 
 
 class Rbf(NamedTuple):
-    """A solved rest pose."""
+    """The solved system of a rest pose."""
 
     kernel: str
     centres: np.ndarray  # (L, 3) float64: landmarks about their centroid, in units
     origin: np.ndarray  # (3,) the centroid
     unit: float
-    inverse: np.ndarray  # (L + 4, L), or (L, L) without p: displacements to coefficients
+    inverse: np.ndarray  # (L + 4, L), or (L, L) without p: maps displacements to coefficients
 
 
 def fit(
@@ -69,13 +69,18 @@ def fit(
 ) -> Rbf:
     """Solve the system of landmarks at rest (L, 3), once for all motions of a face.
 
-    kernel: a name in `KERNELS`. sigma: its width in landmark spacings, by default the kernel's usual one; thin_plate
-    and triharmonic have no width, for them it only scales the smoothing. smoothing: 0 meets every landmark, more lets
-    noisy ones be missed, as in SciPy's RBFInterpolator with epsilon 1 / unit (Gaussian: 1 / (unit sqrt 2)).
-    affine=False leaves p out: displacements fall to 0 away from the landmarks.
+    Args:
+      rest: (L, 3) landmarks at rest.
+      kernel: a name in `KERNELS`.
+      sigma: its width in landmark spacings, by default the kernel's own; thin_plate and triharmonic have no width, for
+        them it only scales the smoothing.
+      smoothing: 0 interpolates every landmark, more approximates noisy ones, as in SciPy's RBFInterpolator with
+        epsilon 1 / unit (Gaussian: 1 / (unit sqrt 2)).
+      affine: False leaves p out: displacements fall to 0 away from the landmarks.
 
-    Raises `ValueError` for landmarks that are too few, not finite, in one place or in one plane, for an option out of
-    range, and for a kernel so wide that the system cannot be solved.
+    Raises:
+      ValueError: landmarks that are too few, not finite, coincident or coplanar; an option out of range; a kernel so
+        wide that the system cannot be solved.
     """
     rest = _points(rest, "landmarks")
     if kernel not in KERNELS:
@@ -95,27 +100,28 @@ def fit(
         terms = np.concatenate([np.ones((len(rest), 1)), centres], axis=1)
         system = np.block([[system, terms], [terms.T, np.zeros((4, 4))]])
     wanted = np.eye(len(system), len(rest))
-    _, _, inverse, info = lapack.dgesv(system, wanted)  # LU, as the paper has it
+    _, _, inverse, info = lapack.dgesv(system, wanted)  # LU, as in the paper
     missed = np.inf if info else np.abs(system @ inverse - wanted).max()
     if not missed < EXACT:
         raise ValueError(
-            f"sigma: {kernel} of width {sigma:g} is too wide for these landmarks, and misses them by {missed:.0e} of "
-            "their displacement; make sigma smaller, or add smoothing"
+            f"sigma: {kernel} of width {sigma:g} is too wide for these landmarks: relative error {missed:.0e} at the "
+            f"landmarks, expected below {EXACT:g}; make sigma smaller, or add smoothing"
         )
     return Rbf(kernel, centres, origin, unit, np.ascontiguousarray(inverse))
 
 
 def weights(fit: Rbf, vertices: np.ndarray) -> np.ndarray:
-    """How far each landmark moves each vertex at rest (N, 3): (N, L) float32, at a landmark a row with a single 1.
+    """Return the weights (N, L) float32 of the landmarks' displacements at vertices at rest (N, 3).
 
-    In float64 on the host, once per face. Raises `ValueError` for vertices that are not finite, or traced.
+    A vertex at a landmark has one weight of 1. Computed in float64 on the host, once per face. Raises `ValueError` for
+    vertices that are not finite, or traced.
     """
     return np.asarray(_spread(fit, _points(vertices, "vertices"), np.float32))
 
 
 @jax.jit
 def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
-    """Displacements (..., N, 3) of the vertices, from those of the landmarks (..., L, 3) and weights (N, L).
+    """Return the displacements (..., N, 3) of the vertices from those of the landmarks (..., L, 3) and weights (N, L).
 
     One matrix product for all frames. Weights (..., N, L) broadcast their leading axes with those of the displacements.
     """
@@ -125,29 +131,29 @@ def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
     for name, array in (("weights", weights), ("displacements", displacements)):
         if not jnp.issubdtype(jnp.result_type(array), jnp.floating):
             raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
-    # GPUs multiply float32 with ten bits of mantissa unless told otherwise. One product for each axis: the batched one
-    # of (N, L) by (L, 3) is so narrow that a CPU takes two to four times as long.
+    # By default GPUs multiply float32 with ten bits of mantissa. One product for each axis: a batched product of (N, L)
+    # by (L, 3) is so narrow that a CPU takes two to four times as long.
     precision = jax.lax.Precision.HIGHEST
     axes = [jnp.einsum("...nl,...l->...n", weights, displacements[..., c], precision=precision) for c in range(3)]
     return jnp.stack(axes, axis=-1)
 
 
 def apply(fit: Rbf, displacements: jax.Array, vertices: np.ndarray) -> jax.Array:
-    """Displacements (..., N, 3) of vertices at rest (N, 3), where the landmarks move by (..., L, 3).
+    """Return the displacements (..., N, 3) of vertices at rest (N, 3), where the landmarks move by (..., L, 3).
 
     `displacements` may be traced by jit, vmap or grad. `vertices` may not: under jit compute `weights` outside.
     """
-    # The weights stay where they were made: taken to the host and back, they cost a sixth of the whole.
+    # The weights stay on their device: a round trip to NumPy takes a sixth of the total time.
     return warp(_spread(fit, _points(vertices, "vertices"), np.float32), displacements)
 
 
 def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **options) -> np.ndarray:
-    """`apply` as Seo & Luo (2021) have it, with a new system for every frame: (T, N, 3) float32.
+    """Return displacements (T, N, 3) float32 with a new system for every frame, as in Seo & Luo (2021).
 
-    The step from one frame to the next is spread about where the landmarks (L, 3), displaced from rest by (T, L, 3),
-    had come, over where the vertices (N, 3) had come; options as of `fit`. It agrees with `apply` at the landmarks, in
-    the first frame, and in affine motion. Elsewhere it depends on the path, and vertices need not return to rest when
-    the landmarks do. Raises `ValueError`, naming the frame, where moving landmarks meet.
+    Each step is interpolated from the previous positions of the landmarks (L, 3), displaced from rest by (T, L, 3), at
+    the previous positions of the vertices (N, 3); options as of `fit`. It agrees with `apply` at the landmarks, in the
+    first frame, and in affine motion. Elsewhere it depends on the path, and vertices need not return to rest when the
+    landmarks do. Raises `ValueError`, naming the frame, where moving landmarks coincide.
     """
     rest, start = _points(rest, "landmarks"), _points(vertices, "vertices")
     displacements = np.asarray(displacements, np.float64)
@@ -166,9 +172,9 @@ def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **o
 
 
 def _spread(fit: Rbf, vertices: np.ndarray, dtype: type) -> jax.Array:
-    """How far each landmark moves each vertex (N, 3): (N, L) of a dtype on the host, computed in float64."""
+    """Return the weights (N, L) at vertices (N, 3), of a dtype, on the host, computed in float64."""
     host = jax.devices("cpu")[0]
-    # Also within a trace: everything here is known.
+    # Also within a trace: all inputs are concrete.
     with jax.ensure_compile_time_eval(), jax.enable_x64(True), jax.default_device(host):
         return _spread_on(fit.kernel, dtype, fit[1:], vertices)
 
@@ -182,7 +188,7 @@ def _spread_on(kernel: str, dtype: type, fit: tuple, vertices: jax.Array) -> jax
     count = len(centres)
     found = KERNELS[kernel].phi(jnp, squared) @ inverse[:count]
     if len(inverse) > count:
-        # Not by a wider product: to put columns beside the basis is a pass over memory, a sum on the way out is none.
+        # Not by a wider product: appending columns to the basis is one more pass over memory, this sum is fused.
         found += inverse[count] + sum(points[:, None, axis] * inverse[count + 1 + axis] for axis in range(3))
     return found.astype(dtype)
 
@@ -209,8 +215,8 @@ def _wendland_c2(xp: ModuleType, squared: Any) -> Any:
 
 
 # Signed so that phi is positive definite (for q with P'q = 0): smoothing then smooths. Default kernel and widths are
-# the best of `experiments.rbf_warp`, but that the Gaussian stays at 1: 1.25 is 2 % better with parted lips, and half as
-# bad again without.
+# the best of `experiments.rbf_warp`, except that the Gaussian stays at 1: 1.25 is 2 % better with parted lips, and 50 %
+# worse without.
 KERNELS = {
     "gaussian": Kernel(_gaussian, 1.0, True),  # exp(-r^2 / 2)
     "multiquadric": Kernel(_multiquadric, 0.5, False),  # -sqrt(1 + r^2)
@@ -221,22 +227,26 @@ KERNELS = {
 
 
 def _points(points: np.ndarray, name: str) -> np.ndarray:
-    """(K, 3) float64; raises for another shape, a tracer, and the first row that is not finite."""
+    """Return points as (K, 3) float64; raises for another shape, a tracer, and the first row that is not finite."""
     if isinstance(points, jax.core.Tracer):
-        raise ValueError(f"{name}: traced, but needed as numbers; compute `weights` outside jit and `warp` inside")
+        raise ValueError(
+            f"{name}: expected concrete values, got a tracer; compute `weights` outside jit and `warp` inside"
+        )
     points = np.asarray(points, np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"{name}: expected (K, 3), got shape {points.shape}")
     finite = np.isfinite(points).all(axis=1)
     if not finite.all():
-        raise ValueError(f"{name}: number {int(np.argmin(finite))} is not finite: {points[np.argmin(finite)]}")
+        raise ValueError(f"{name}: row {int(np.argmin(finite))} is not finite: {points[np.argmin(finite)]}")
     return points
 
 
 def _spacing(rest: np.ndarray, affine: bool) -> float:
-    """The mean distance of a landmark to its nearest other; raises where the landmarks determine no motion."""
+    """Return the mean distance of a landmark to its nearest other; raises where the system is singular."""
     if len(rest) < 4 and affine:
-        raise ValueError(f"landmarks: the affine term needs 4 that are not in one plane, got {len(rest)}; add some")
+        raise ValueError(
+            f"landmarks: the affine term needs 4 that are not coplanar, got {len(rest)}; add some, or affine=False"
+        )
     if len(rest) < 2:
         raise ValueError("landmarks: expected at least 2, got 1")
     sizes = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
@@ -244,7 +254,7 @@ def _spacing(rest: np.ndarray, affine: bool) -> float:
     pairs = tree.query_pairs(COINCIDENT * sizes[0], output_type="ndarray")
     if len(pairs):
         a, b = min(map(tuple, pairs.tolist()))
-        raise ValueError(f"landmarks {a} and {b} are in one place, {rest[a]}; leave one out")
+        raise ValueError(f"landmarks {a} and {b} coincide at {rest[a]}; leave one out")
     if affine and sizes[2] <= COINCIDENT * sizes[0]:
-        raise ValueError("landmarks: all in one plane, which leaves the affine term open; add one, or affine=False")
+        raise ValueError("landmarks: coplanar, so the affine term is undetermined; add one, or affine=False")
     return float(np.mean(tree.query(rest, k=2)[0][:, 1]))

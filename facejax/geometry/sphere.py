@@ -13,8 +13,8 @@ the angle is taken by atan2, which is accurate near 0 and near pi, where an arc 
 Singular points. `exp` is smooth everywhere and `log` at the identity too; their series take over from a
 radius that depends on the dtype. `norm` and `distance` have a kink at 0, and `distance` one at the antipode:
 the gradient there is 0. At the antipode `log` has no limit; it returns pi times a fixed tangent direction,
-with gradient 0, and `geodesic` and `transport` follow the half circle along that direction. Nothing gives a
-NaN; a point that is zero, as a motion at standstill is, has logarithm and distance 0.
+with gradient 0, and `geodesic` and `transport` follow the half circle along that direction. No value or gradient
+is NaN; a point that is zero, the SRVF of a constant curve, has logarithm and distance 0.
 """
 
 from __future__ import annotations
@@ -29,33 +29,33 @@ from jax import lax
 
 
 @jax.jit
-def root(squared: jax.Array) -> jax.Array:
-    """The square root of an array of any shape; 0, with derivative 0, where it is not positive."""
-    # The argument is made safe before the root is taken: a `where` after it alone would let a NaN flow back.
+def safe_sqrt(squared: jax.Array) -> jax.Array:
+    """Return the square root of an array of any shape; 0, with derivative 0, where it is not positive."""
+    # The argument is made safe before the root is taken: a `where` after it alone would propagate a NaN gradient.
     positive = squared > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
 
 
 @jax.jit
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Inner product (...) of a and b (..., T-1, L, 3): the sum over landmarks and axes, the mean over steps.
+    """Return the inner product (...) of a and b (..., T-1, L, 3): the sum over landmarks and axes, the mean over steps.
 
     Raises `ValueError` on shapes that end differently, or on a dtype that is not floating.
     """
     _check(a, b)
-    # In one axis: XLA's code for a CPU takes three times as long to sum over rows of three.
+    # Flattened to one axis: XLA's code for a CPU takes three times as long to sum over rows of three.
     return jnp.sum(_flat(a) * _flat(b), axis=-1) / a.shape[-3]
 
 
 @jax.jit
 def norm(a: jax.Array) -> jax.Array:
-    """Norm (...) of a (..., T-1, L, 3); its gradient at 0 is 0."""
-    return root(inner(a, a))
+    """Return the norm (...) of a (..., T-1, L, 3); its gradient at 0 is 0."""
+    return safe_sqrt(inner(a, a))
 
 
 @jax.jit
 def project(p: jax.Array, v: jax.Array) -> jax.Array:
-    """The part (..., T-1, L, 3) of v that is tangent at the point p. p may have any length."""
+    """Return the component (..., T-1, L, 3) of v tangent at the point p. p may have any length."""
     # Dividing by <p, p> costs one product and makes the result independent of rounding in the length of p.
     squared = inner(p, p)
     along = inner(p, v) / jnp.where(squared > 0, squared, 1)
@@ -64,9 +64,9 @@ def project(p: jax.Array, v: jax.Array) -> jax.Array:
 
 @jax.jit
 def exp(p: jax.Array, v: jax.Array) -> jax.Array:
-    """The point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
+    """Return the point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
 
-    It has unit norm where v is tangent at p: `project` first what may not be.
+    It has unit norm where v is tangent at p; `project` a vector that may not be.
     """
     cosine, sinc = _cos_sinc(inner(v, v))
     return _wide(cosine) * p + _wide(sinc) * v
@@ -74,7 +74,7 @@ def exp(p: jax.Array, v: jax.Array) -> jax.Array:
 
 @jax.jit
 def log(p: jax.Array, q: jax.Array) -> jax.Array:
-    """The tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
+    """Return the tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
     _check(p, q)
     along = _log(p, q)
     return _wide(along.scale) * _tangent(p, q, along)
@@ -82,23 +82,23 @@ def log(p: jax.Array, q: jax.Array) -> jax.Array:
 
 @jax.jit
 def distance(p: jax.Array, q: jax.Array) -> jax.Array:
-    """The angle (...) between p and q, in [0, pi]; its gradient is 0 at p = q and at p = -q."""
+    """Return the angle (...) between p and q, in [0, pi]; its gradient is 0 at p = q and at p = -q."""
     _, _, squared, cosine, _ = _split(p, q)
     empty = (squared == 0) & (cosine == 0)
-    return jnp.arctan2(root(squared), jnp.where(empty, 1, cosine))
+    return jnp.arctan2(safe_sqrt(squared), jnp.where(empty, 1, cosine))
 
 
 @jax.jit
 def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
-    """The point (..., T-1, L, 3) at the fraction tau (...) of the shortest arc from p (tau 0) to q (tau 1).
+    """Return the point (..., T-1, L, 3) at the fraction tau (...) of the shortest arc from p to q.
 
     Equation 10 with its parentheses restored, (sin((1-tau) theta) p + sin(tau theta) q) / sin theta, written
     as exp(p, tau log(p, q)): no quotient of sines at 0 and at pi. tau outside [0, 1] extrapolates along the
     circle.
     """
     _check(p, q)
-    # The logarithm is not written to memory: sums over p, q and their difference give its few numbers, and the point is
-    # made of the same arrays.
+    # The logarithm is not written to memory: sums over p, q and their difference give its coefficients, and the point
+    # is a combination of the same arrays.
     along = _log(p, q)
     way = jnp.asarray(tau, jnp.result_type(p, q)) * along.scale
     cosine, sinc = _cos_sinc(jnp.square(way) * along.squared)
@@ -107,7 +107,7 @@ def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
 
 @jax.jit
 def transport(p: jax.Array, q: jax.Array, v: jax.Array) -> jax.Array:
-    """Parallel transport (..., T-1, L, 3) of the tangent vector v from p to q along their geodesic."""
+    """Transport the tangent vector v from p to q, parallel along their geodesic: (..., T-1, L, 3)."""
     # On tangent vectors at p, transport is the reflection across the hyperplane normal to p + q. A reflection
     # keeps lengths to the last digit, also near the antipode, where 1 + <p, q> would cancel.
     _check(p, q, v)
@@ -119,9 +119,9 @@ def transport(p: jax.Array, q: jax.Array, v: jax.Array) -> jax.Array:
 
 @jax.jit
 def extrinsic_mean(qs: jax.Array) -> jax.Array:
-    """The average (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3), brought back to the sphere.
+    """Return the mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3), normalised to the sphere.
 
-    Where the average vanishes, as that of two antipodes does, the first point is returned.
+    Where the mean vanishes, as that of two antipodes does, the first point is returned.
     """
     _check_set(qs)
     average = jnp.mean(qs, axis=-4)
@@ -132,7 +132,7 @@ def extrinsic_mean(qs: jax.Array) -> jax.Array:
 
 @jax.jit(static_argnames=("steps",))
 def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = None) -> jax.Array:
-    """The point (..., T-1, L, 3) of least summed squared distance to qs (..., K, T-1, L, 3).
+    """Return the Fréchet mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3): of least summed squared distance.
 
     From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
     `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole batch, or for
@@ -162,12 +162,12 @@ def _check_set(qs: jax.Array) -> None:
 
 
 def _wide(scalars: jax.Array) -> jax.Array:
-    """One number per point (...) -> (..., 1, 1, 1)."""
+    """Reshape one number per point (...) to (..., 1, 1, 1)."""
     return jnp.asarray(scalars)[..., None, None, None]
 
 
 def _cos_sinc(squared: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """cos x and sin x / x from x squared, of which both are smooth functions."""
+    """Return cos x and sin x / x from x squared, of which both are smooth functions."""
     near = squared < jnp.finfo(squared.dtype).eps ** 0.25
     s = jnp.where(near, squared, 0)
     x = jnp.sqrt(jnp.where(near, 1, squared))
@@ -177,10 +177,10 @@ def _cos_sinc(squared: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 class _Along(NamedTuple):
-    """scale (q - sign p - lean p) is log(p, q); at the antipode, scale times a fixed direction at p is."""
+    """Coefficients of log(p, q) = scale (q - sign p - lean p); at the antipode, scale times a fixed direction at p."""
 
     scale: jax.Array
-    squared: jax.Array  # norm of what is scaled
+    squared: jax.Array  # squared norm of the vector that is scaled
     sign: jax.Array
     lean: jax.Array
     antipode: jax.Array
@@ -205,7 +205,7 @@ def _log(p: jax.Array, q: jax.Array) -> _Along:
 
 
 def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
-    """Of the part u = d - lean p of q that is tangent at p, d = q - sign p: sign, lean, |u|^2; and <p, q>, <p, p>."""
+    """Return sign, lean, |u|^2, <p, q> and <p, p>, where u = q - sign p - lean p is tangent at p."""
     cosine = inner(p, q)
     # Near p (or -p) the difference d is free of rounding, and projecting it instead of q keeps small angles to full
     # relative precision; in exact arithmetic the projection is the same. |d|^2 is twice |u|^2 at most.
@@ -218,13 +218,13 @@ def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
 
 
 def _tangent(p: jax.Array, q: jax.Array, along: _Along) -> jax.Array:
-    """What `_Along.scale` scales, tangent at p: (..., T-1, L, 3)."""
+    """Return the vector (..., T-1, L, 3), tangent at p, that `_Along.scale` multiplies."""
     found = (q - _wide(along.sign) * p) - _wide(along.lean) * p
     return jnp.where(_wide(along.antipode), _fixed_direction(p, along.own), found)
 
 
 def _fixed_direction(p: jax.Array, own: jax.Array) -> jax.Array:
-    """A unit tangent vector at p: along the first coordinate, or the second where p leans on the first. own: <p, p>."""
+    """Return a unit tangent vector at p: the first axis projected, or the second where p is nearer the first."""
     first = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 0].set(1)
     second = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 1].set(1)
     leans = jnp.abs(p[..., 0, 0, 0]) > jnp.abs(p[..., 0, 0, 1])
@@ -236,12 +236,12 @@ def _fixed_direction(p: jax.Array, own: jax.Array) -> jax.Array:
 
 
 def _flat(point: jax.Array) -> jax.Array:
-    """(..., T-1, L, 3) -> (..., D)."""
+    """Flatten (..., T-1, L, 3) to (..., D)."""
     return point.reshape(*point.shape[:-3], math.prod(point.shape[-3:]))
 
 
 def _pull(p: jax.Array, qs: jax.Array) -> jax.Array:
-    """The mean of log(p, qs) over the points: minus the gradient of half the mean squared distance."""
+    """Return the mean of log(p, qs) over the points: minus the gradient of half the mean squared distance."""
     return jnp.mean(log(p[..., None, :, :, :], qs), axis=-4)
 
 
@@ -254,7 +254,7 @@ def _karcher(steps: int, qs: jax.Array, tolerance: jax.Array) -> jax.Array:
     def move(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         step, p, v = carry
         p = exp(p, v)
-        # Many steps would add up their rounding in the length of p.
+        # Rounding of the length of p would accumulate over the steps.
         p = p / _wide(norm(p))
         return step + 1, p, _pull(p, qs)
 

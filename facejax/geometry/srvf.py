@@ -1,4 +1,4 @@
-"""The square-root velocity transform: a landmark curve <-> a point on the sphere and the log of its length.
+"""The square-root velocity function (SRVF): a landmark curve as a point on the sphere and the log of its length.
 
 A curve is (..., T, L, 3): T frames, evenly spaced in time over [0, 1], in any unit. Its steps are the T-1
 forward differences d, each taken as one vector of 3L numbers; its length is the sum of their norms. The point
@@ -6,12 +6,12 @@ forward differences d, each taken as one vector of 3L numbers; its length is the
     q = v / sqrt|v|,   v = (T-1) d / length                                (Otberdout et al. 2023, eq. 1)
 
 then has exactly unit norm on `facejax.geometry.sphere`, whatever T is, and the inverse, a running sum, is
-exact. Unit length throws the amplitude away: `encode` returns it beside q, as the natural log of the length
-in the curve's own unit.
+exact. Normalising to unit length discards the amplitude: `encode` returns it beside q, as the natural log of the
+length in the curve's own unit.
 
-Standing still. A curve shorter than 1e-12 has q = 0 and log_length = log 1e-12, and decodes to the constant
+Constant curves. A curve shorter than 1e-12 has q = 0 and log_length = log 1e-12, and decodes to the constant
 curve. q grows as the square root of a step, so it has no derivative where a step is zero: the gradient of
-that step is 0 there, as is every gradient of a curve that stands still. Everywhere else gradients are exact.
+that step is 0 there, as is every gradient of a constant curve. Everywhere else gradients are exact.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from facejax.geometry.sphere import root
+from facejax.geometry.sphere import safe_sqrt
 
 FLOOR = 1e-12
-"""Length below which a curve stands still, in the curve's unit."""
+"""Length below which a curve counts as constant, in the curve's unit."""
 
 BLOCK = 32  # steps
 
 
 @jax.jit
 def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Curve (..., T, L, 3) -> q (..., T-1, L, 3) on the unit sphere, and log_length (...).
+    """Encode a curve (..., T, L, 3) as q (..., T-1, L, 3) on the unit sphere, and log_length (...).
 
     Nothing is centred or scaled here (see `facejax.geometry.align.normalise`). Raises `ValueError` on fewer
     than two frames, on a last axis that is not 3, or on a dtype that is not floating.
@@ -38,9 +38,9 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
     _check(curve, "curve", "T", 2)
     flat = _flat(curve)
     steps = flat[..., 1:, :] - flat[..., :-1, :]
-    # q does not depend on the scale of the steps, and the length is proportional to it. So both may be
-    # computed on steps divided by their largest entry, held constant: values and gradients are the same, and
-    # no square leaves the range of float32, however small the unit.
+    # q does not depend on the scale of the steps, and the length is proportional to it. So both are computed
+    # on steps divided by their largest entry, held constant: values and gradients are the same, and no square
+    # overflows or underflows float32, whatever the unit.
     largest = lax.stop_gradient(jnp.max(jnp.abs(steps), axis=(-2, -1)))
     scale = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
     steps = steps / scale[..., None, None]
@@ -48,7 +48,7 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
     # Below this a step is less than the rounding of the largest, and the powers of its gradient would
     # overflow.
     moved = squared > jnp.finfo(squared.dtype).tiny ** 0.5
-    norms = root(jnp.where(moved, squared, 0))
+    norms = safe_sqrt(jnp.where(moved, squared, 0))
     relative = jnp.sum(norms, axis=-1)
     moving = scale * relative > FLOOR
     relative = jnp.where(moving, relative, 1)
@@ -60,10 +60,10 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @jax.jit
 def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
-    """q (..., T-1, L, 3), log_length (...), start (..., L, 3) -> curve (..., T, L, 3) in the unit of start.
+    """Decode q (..., T-1, L, 3), log_length (...) and start (..., L, 3) to a curve (..., T, L, 3) in the unit of start.
 
     The inverse of `encode`. Each step is length q|q| / (T-1); the curve's length is exp(log_length) where q
-    is on the unit sphere, which is not checked.
+    is on the unit sphere, which is not checked. Raises `ValueError` on shapes that do not fit.
     """
     _check(q, "q", "T-1", 1)
     if jnp.shape(start)[-2:] != q.shape[-2:]:
@@ -75,32 +75,32 @@ def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
 
 @jax.jit
 def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
-    """The steps (..., T-1, L, 3) between frames, exp(log_length) q|q| / (T-1), for q (..., T-1, L, 3)."""
+    """Return the steps (..., T-1, L, 3) between frames, exp(log_length) q|q| / (T-1), for q (..., T-1, L, 3)."""
     _check(q, "q", "T-1", 1)
     return _pace(q, log_length)[..., None, None] * q
 
 
 @jax.jit
 def arc_length_fraction(q: jax.Array) -> jax.Array:
-    """The share (..., T) of its path that the motion q (..., T-1, L, 3) has covered by each frame, from 0 to 1.
+    """Return the fraction (..., T) of its arc length that the motion q (..., T-1, L, 3) has covered by each frame.
 
-    Speed is |q|^2, so this is the time-warp that makes the motion from one of even speed. A motion at standstill has
-    covered 0 throughout.
+    Speed is |q|^2, so this is the time warp from constant speed to the motion. It runs from 0 to 1; for a constant
+    motion it is 0 throughout.
     """
     _check(q, "q", "T-1", 1)
     speed = jnp.sum(q**2, axis=(-2, -1))
     total = jnp.sum(speed, axis=-1, keepdims=True)
     moving = total > 0
-    # Neither the last nor what comes before it is left to rounding.
+    # Rounding may take no fraction above 1, nor the last one off 1.
     share = jnp.minimum(jnp.cumsum(speed[..., :-1], axis=-1) / jnp.where(moving, total, 1), 1)
     return jnp.concatenate([jnp.zeros_like(total), share, jnp.where(moving, jnp.ones_like(total), 0)], axis=-1)
 
 
 @jax.jit
 def length(curve: jax.Array) -> jax.Array:
-    """Length (...) of the curve (..., T, L, 3) in its own unit: the sum of the norms of its (L, 3) steps."""
+    """Return the length (...) of a curve (..., T, L, 3) in its own unit: the sum of the norms of its (L, 3) steps."""
     _check(curve, "curve", "T", 2)
-    return jnp.sum(root(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1))), axis=-1)
+    return jnp.sum(safe_sqrt(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1))), axis=-1)
 
 
 def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
@@ -112,22 +112,22 @@ def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
 
 
 def _flat(curve: jax.Array) -> jax.Array:
-    """(..., T, L, 3) -> (..., T, 3 L): XLA's code for a CPU is slow where the last axis is short."""
+    """Reshape (..., T, L, 3) to (..., T, 3 L): XLA's code for a CPU is slow where the last axis is short."""
     return curve.reshape(*curve.shape[:-2], 3 * curve.shape[-2])
 
 
 def _pace(q: jax.Array, log_length: jax.Array) -> jax.Array:
-    """What a step is of its q, exp(log_length) |q| / (T-1): (..., T-1)."""
+    """Return the factor (..., T-1) from q to its step, exp(log_length) |q| / (T-1)."""
     # q|q| is differentiable at 0, with derivative 0, and the safe root gives just that.
-    norms = root(jnp.sum(_flat(q) ** 2, axis=-1))
+    norms = safe_sqrt(jnp.sum(_flat(q) ** 2, axis=-1))
     return jnp.exp(jnp.asarray(log_length))[..., None] * norms / q.shape[-3]
 
 
 def _running(pace: jax.Array, q: jax.Array) -> jax.Array:
-    """Sums (..., T, D) over the first 0, 1, ..., T-1 steps pace (..., T-1) times q (..., T-1, D).
+    """Return the sums (..., T, D) of the first 0, 1, ..., T-1 steps pace (..., T-1) times q (..., T-1, D).
 
-    A product with a triangle of ones, which takes a tenth of a running sum's time on a CPU (1,000 motions of 30 frames:
-    2 ms instead of 22). Longer motions go block by block.
+    A product with a triangular matrix of ones, which takes a tenth of a cumulative sum's time on a CPU (1,000 motions
+    of 30 frames: 2 ms instead of 22). Longer motions are summed in blocks.
     """
     count = q.shape[-2]
     if count <= BLOCK:

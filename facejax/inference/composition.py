@@ -59,29 +59,30 @@ def compose(
     pairs = label_pairs(labels, classes=len(generator.chart.mean))
     drawn = draw(generator, starts, sample_keys(key, samples), pairs)
     count, length = drawn.curves.shape[1:3]
-    each = [length if frames is None else frames] * count if np.ndim(frames) == 0 else frames
+    values = np.asarray(length if frames is None else frames)
+    each = [values.item()] * count if values.ndim == 0 else values.tolist()
     if len(each) != count:
         raise ValueError(f"frames: expected one number, or {count} for {count} transitions, got {len(each)}")
     return join(drawn.curves, jnp.asarray(timeline(each, drawn=length)))
 
 
-def label_pairs(labels: Sequence[int], *, classes: int | None = None) -> jax.Array:
+def label_pairs(labels: Sequence[int] | np.ndarray, *, classes: int | None = None) -> jax.Array:
     """Return the transitions (P, 2) int32 through label indices.
 
     Raises `ValueError` for names, an index outside 0..classes-1, or a label that repeats the previous one.
     """
-    labels = np.asarray(labels)
-    if labels.ndim != 1 or len(labels) < 2:
-        raise ValueError(f"labels: expected at least a start and an end, got {labels.tolist()}")
-    if labels.dtype.kind not in "iu":
-        raise ValueError(f"labels: expected indices, got {labels.tolist()}; `pipeline.label_indices` converts names")
-    outside = np.flatnonzero((labels < 0) | (labels >= (np.inf if classes is None else classes)))
+    numbers = np.asarray(labels)
+    if numbers.ndim != 1 or len(numbers) < 2:
+        raise ValueError(f"labels: expected at least a start and an end, got {numbers.tolist()}")
+    if numbers.dtype.kind not in "iu":
+        raise ValueError(f"labels: expected indices, got {numbers.tolist()}; `pipeline.label_indices` converts names")
+    outside = np.flatnonzero((numbers < 0) | (numbers >= (np.inf if classes is None else classes)))
     if outside.size:
         last = "" if classes is None else f" to {classes - 1}"
-        raise ValueError(f"labels: number {outside[0] + 1} is {labels[outside[0]]}, expected one from 0{last}")
-    if (same := np.flatnonzero(labels[1:] == labels[:-1])).size:
+        raise ValueError(f"labels: number {outside[0] + 1} is {numbers[outside[0]]}, expected one from 0{last}")
+    if (same := np.flatnonzero(numbers[1:] == numbers[:-1])).size:
         raise ValueError(f"labels: number {same[0] + 2} repeats the previous one; a transition needs two labels")
-    return jnp.asarray(np.stack([labels[:-1], labels[1:]], axis=1), jnp.int32)
+    return jnp.asarray(np.stack([numbers[:-1], numbers[1:]], axis=1), jnp.int32)
 
 
 def sample_keys(key: jax.Array, samples: int) -> jax.Array:
@@ -131,8 +132,8 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
 
     Transition i gets `frames[i]` frames; joints are not repeated: F = 1 + sum(frames - 1). Frames between generated
     ones are interpolated by cubic curves (Catmull-Rom). The steps on both sides of a joint become equal, and the
-    correction decays over `reach` frames; first and last frames do not change, nor does a joint between transitions of two frames,
-    which have no frame beside it. All of this is linear in the frames, hence one matrix for all samples.
+    correction decays over `reach` frames; first and last frames do not change, nor does a joint between transitions of
+    two frames, which have no frame beside it. All of this is linear in the frames, hence one matrix for all samples.
 
     Raises:
       ValueError: fewer than two frames.

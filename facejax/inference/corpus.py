@@ -34,7 +34,7 @@ MESH_BATCH = 16  # sequences decoded in one call
 class Request(NamedTuple):
     """What to generate."""
 
-    count: int
+    count: int  # of sequences  # pyright: ignore[reportIncompatibleMethodOverride]
     labels: tuple[str, ...] = ()  # of every motion; none: two different ones are drawn for each
     seed: int = 7
     frames: int = pipeline.FRAMES  # of a transition
@@ -49,7 +49,7 @@ def generate(
     neutrals: dict[str, np.ndarray],
     out: str | Path,
     *,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> corpora.Corpus:
     """Write a corpus, or the shards that are missing of it, and return it.
@@ -136,7 +136,7 @@ def maker(
     request: Request,
     neutrals: dict[str, np.ndarray],
     *,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> Callable[[int, int], dict[str, np.ndarray]]:
     """Return `make(first, count)`: the arrays of sequences by number. Arguments and errors as of `generate`."""
     plan, faces = _plan(models, request, neutrals), list(neutrals.values())
@@ -197,7 +197,7 @@ def _meshes(models: pipeline.Models, marks: np.ndarray, person: np.ndarray, neut
     return made
 
 
-def _write(out: Path, number: int, made: dict[str, np.ndarray]) -> None:
+def _write(out: Path, number: int, made: dict[str, Any]) -> None:
     buffer = streams.BytesIO()
     np.savez(buffer, **made)
     data = buffer.getvalue()

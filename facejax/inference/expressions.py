@@ -38,15 +38,15 @@ class Expressions(NamedTuple):
 
 def load(path: str | os.PathLike | None = None) -> Expressions:
     """Read the released networks, or those of a file. Raises `weights.WeightsError`."""
-    path = path or resources.files("facejax.assets").joinpath(RELEASED)
-    about = weights.load_metadata(path)
+    file: Any = path or resources.files("facejax.assets").joinpath(RELEASED)
+    about = weights.load_metadata(file)
     try:
         config = expression_lstm.Config(**about["config"])
         labels, rate, frames = tuple(about["labels"]), float(about["rate"]), int(about["frames"])
         like = _structure(config, len(labels))
     except (KeyError, TypeError, ValueError) as error:
-        raise weights.WeightsError(f"{path} does not describe expression networks ({error})") from error
-    tree, about = weights.load(path, like)
+        raise weights.WeightsError(f"{file} does not describe expression networks ({error})") from error
+    tree, about = weights.load(file, like)
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
     return Expressions(labels, params, config, rate, frames, about["about"])
 

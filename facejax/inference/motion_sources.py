@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from facejax.data import blendshapes
 from facejax.data.synthetic import makehuman, rig
 from facejax.inference import expressions, pipeline
 from facejax.io import livelink
@@ -68,14 +69,16 @@ def from_labels(
     Raises `ValueError` as `pipeline.displacements` does.
     """
     models = pipeline.load(weights)
-    if frames == NATURAL:
+    if isinstance(frames, str):
+        if frames != NATURAL:
+            raise ValueError(f"frames: expected numbers or {NATURAL!r}, got {frames!r}")
         frames = pipeline.durations(models, jax.random.key(seed), labels)
     curve = pipeline.displacements(models, jax.random.key(seed), labels, samples=1, frames=frames)[0]
     return Motion(np.asarray(curve), "_".join(labels), pipeline.captions(labels, frames=frames), pipeline.RATE)
 
 
 def from_recording(recording: livelink.Recording, *, name: str) -> Motion:
-    """Return the landmark motion of the average face that plays an evenly sampled recording (`livelink.resample`)."""
+    """Return the landmark motion of the average face that plays an evenly sampled recording (`blendshapes.resample`)."""
     person, marks = makehuman.average(), makehuman.template().landmarks
     rest = person.vertices[marks]
     scale = float(np.linalg.norm(rest - rest.mean(axis=0)))
@@ -101,8 +104,8 @@ def read_recording(
     whole = livelink.read(path)
     if at_rest:
         # Estimated from the whole recording: the selected part may contain no resting face.
-        whole = livelink.subtract_rest(whole)
-    even = livelink.resample(whole, rate=rate)
+        whole = blendshapes.subtract_rest(whole)
+    even = blendshapes.resample(whole, rate=rate)
     length = float(even.times[-1])
     chosen = (even.times >= begin - 1e-9) & (even.times < begin + seconds - 1e-9)
     if chosen.sum() < 2:
@@ -120,7 +123,7 @@ def animate_person(recording: livelink.Recording, person: makehuman.Subject, *, 
 
     Returns vertices (T, M, 3) of skin, eyes and teeth; mm.
     """
-    return rig.pose(rig.build(person, level=LEVEL), intensity * livelink.unit_weights(recording, rig.unit_names()))
+    return rig.pose(rig.build(person, level=LEVEL), intensity * blendshapes.unit_weights(recording, rig.unit_names()))
 
 
 def rate_of(recording: livelink.Recording) -> float:

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from facejax.inference import checks, composition
 from facejax.models.bundle import Face, Models, load, save
@@ -95,7 +96,8 @@ def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: fl
 def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ...]:
     """Return the frames of each transition. Raises `ValueError` for a wrong count or fewer than two frames."""
     count = len(labels) - 1
-    found = (frames,) * count if np.ndim(frames) == 0 else tuple(frames)
+    values = np.asarray(frames)
+    found = [values.item()] * count if values.ndim == 0 else values.tolist()
     if len(found) != count:
         raise ValueError(f"frames: expected one number, or {count} for {count} transitions, got {len(found)}")
     if any(n != int(n) or n < 2 for n in found):
@@ -105,7 +107,7 @@ def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ..
 
 def meshes(
     models: Models,
-    landmarks: jax.Array,
+    landmarks: np.ndarray | jax.Array,
     neutral: np.ndarray | jax.Array,
     *,
     refined: bool = True,
@@ -148,7 +150,7 @@ def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Ar
     expected = models.face.vertices.shape
     if np.shape(neutral) != expected:
         raise ValueError(f"neutral: expected vertices {expected} in the models' topology, got {np.shape(neutral)}")
-    if not isinstance(neutral, jax.core.Tracer):
+    if not isinstance(neutral, Tracer):
         size, usual = (
             np.linalg.norm(np.ptp(np.asarray(x)[models.face.landmark_index], axis=0))
             for x in (neutral, models.face.vertices)

@@ -111,7 +111,9 @@ def bind(registered: np.ndarray, faces: np.ndarray, scan: np.ndarray, scan_faces
     """Bind scan vertices (V, 3) to the registered template (N, 3)."""
     scan_faces = _oriented(np.asarray(scan_faces), scan, registered, faces)
     normals = vertex_normals_host(np.asarray(scan, np.float64), scan_faces)
-    hits = closest_point.closest_points(closest_point.surface(registered, faces), scan, normals=normals, turn=REACH / 4)
+    hits = closest_point.closest_points(
+        closest_point.surface(registered, faces), scan, normals=normals, normal_weight=REACH / 4
+    )
     decay = 1 - smoothstep(hits.distance, 0, REACH)
     return Binding(np.asarray(faces)[hits.face], (hits.weights * decay[:, None]).astype(np.float32))
 
@@ -190,11 +192,11 @@ def _refine(
 def _matches(here: np.ndarray, faces: np.ndarray, scan: closest_point.Surface, far: float):
     """Return the nearest scan point of each vertex (N, 3), its normal, and a weight (N,): 0 where nothing matches."""
     own = vertex_normals_host(here, faces)
-    hits = closest_point.closest_points(scan, here, normals=own, turn=far / 4)
+    hits = closest_point.closest_points(scan, here, normals=own, normal_weight=far / 4)
     normals = closest_point.at(scan, hits, scan.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     facing = np.einsum("ni,ni->n", normals, own)
-    good = (hits.distance < far) & (facing > MIN_COSINE) & ~closest_point.on_edge(scan, hits)
+    good = (hits.distance < far) & (facing > MIN_COSINE) & ~closest_point.on_boundary(scan, hits)
     t = np.clip(hits.distance / far, 0, 1)
     return hits.points, normals, np.where(good, (1 - t**2) ** 2, 0.0)
 

@@ -153,6 +153,6 @@ def _weights(vertices, triangles, points, names, count, pin, options) -> tuple[n
 
 def _lips(points: tuple[str, ...], which: np.ndarray) -> tuple[list[int], list[int]] | None:
     """Return upper and lower lip points without corners among `which` of a scheme; None where one has none."""
-    shown = [points[i] for i in which]
-    found = tuple([i for i, name in enumerate(shown) if f"{place} lip" in name] for place in ("upper", "lower"))
-    return found if all(found) else None
+    names = [points[i] for i in which]
+    upper, lower = ([i for i, name in enumerate(names) if f"{side} lip" in name] for side in ("upper", "lower"))
+    return (upper, lower) if upper and lower else None

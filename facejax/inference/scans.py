@@ -95,7 +95,7 @@ def read(path: Path, landmarks: Path) -> Scan:
     if len(scheme_index) < 68:
         notes.append(f"{len(scheme_index)} of 68 landmarks are given, the others are estimated")
     if ignored:
-        notes.append(f"no landmarks' names, ignored over: {', '.join(ignored)}")
+        notes.append(f"ignored landmarks with unknown names: {', '.join(ignored)}")
     return Scan(path.stem, mesh.vertices * unit, mesh.faces, points * unit, scheme_index, unit, tuple(notes))
 
 

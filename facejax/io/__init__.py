@@ -1,7 +1,7 @@
-"""Files in and out: meshes, landmarks, animations, weights. Every reader takes files from untrusted sources.
+"""Readers and writers of meshes, landmarks, animations and weights. All readers accept untrusted files.
 
 `save` writes an animation in the format of the path's suffix (`facejax.io.export`), `load_mesh` reads a mesh
-(`facejax.io.meshes.read`). Both are imported when they are first used: pictures and films need `facejax.viz`.
+(`facejax.io.meshes.read`). Both are imported on first use, because images and videos need `facejax.viz`.
 """
 
 from __future__ import annotations

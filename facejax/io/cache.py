@@ -7,6 +7,6 @@ import platformdirs
 
 
 def folder() -> Path:
-    """The cache folder: `$FACEJAX_CACHE`, or the platform's user cache. It is not created here."""
+    """Return the cache folder: `$FACEJAX_CACHE`, or the platform's user cache. It is not created."""
     chosen = os.environ.get("FACEJAX_CACHE")
     return Path(chosen).expanduser() if chosen else Path(platformdirs.user_cache_dir("facejax"))

@@ -1,4 +1,4 @@
-"""One call for every format: the suffix decides."""
+"""Export of animations and still faces; the suffix of the path selects the format."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from PIL import Image
 from facejax.io import atomic, glb_writer, meshes
 from facejax.viz import html_viewer, render, scene, video
 
-CONTACT_SHEET_FRAMES = 8  # pictures on a contact strip
+CONTACT_SHEET_FRAMES = 8
 
 
 def save(
@@ -26,27 +26,27 @@ def save(
     size=(320, 400),
     camera=None,
 ) -> None:
-    """Saves an animation or a still face, atomically, in the format that the path asks for.
+    """Save an animation or a still face, atomically, in the format of the path's suffix.
 
-    `.glb` animated glTF; `.html` viewer in one file; `.webp`, `.gif`, `.mp4` film; `.png` picture, or a
-    strip of eight pictures of an animation; `.npz` arrays; `.ply`, `.obj` one mesh; a folder, or a path
-    that ends in "/", one PLY per frame. An option that a format cannot show is left out.
+    `.glb` animated glTF; `.html` self-contained viewer; `.webp`, `.gif`, `.mp4` video; `.png` image, or a contact
+    sheet of eight frames of an animation; `.npz` arrays; `.ply`, `.obj` one mesh; a folder, or a path that ends in
+    "/", one PLY per frame. Options that a format does not support are ignored.
 
     Args:
-      path: where to.
+      path: output file or folder.
       vertices: (T, N, 3) or (N, 3) mm.
       faces: (F, 3).
       fps: frames per second.
-      captions: ((first frame, text), ...); each holds until the next.
-      title: heading of the page and name in glTF; the file's name without.
-      landmarks: (T, L, 3) positions or (L,) vertex indices; drawn in pictures, on demand in the page.
-      extras: parts beside the face, see `scene.Part`.
-      colours: (N, 3) sRGB in [0, 1]; also (T, N, 3) in pictures.
-      size: (width, height) of pictures.
-      camera: of pictures, see `render.fit_camera`.
+      captions: ((first frame, text), ...); each is shown until the next.
+      title: heading of the viewer and name in glTF; by default the stem of the path.
+      landmarks: (T, L, 3) positions or (L,) vertex indices; drawn in images, optional in the viewer.
+      extras: further parts, see `scene.Part`.
+      colours: (N, 3) sRGB in [0, 1]; in images also (T, N, 3).
+      size: (width, height) of images.
+      camera: of images, see `render.fit_camera`.
 
     Raises:
-      ValueError: unknown suffix, a scene out of order, or an animation in a format for one mesh.
+      ValueError: the suffix is unknown, arrays have wrong shapes, or the format holds one mesh and there are several.
     """
     name, path = os.fspath(path), Path(path)
     shot = scene.make(vertices, faces, fps=fps, captions=captions, landmarks=landmarks, extras=extras)
@@ -73,7 +73,9 @@ def save(
         _write_arrays(path, shot)
     elif suffix in (".ply", ".obj"):
         if len(shot.vertices) > 1:
-            raise ValueError(f"{path}: {suffix} holds one mesh, got {len(shot.vertices)} frames; end the path in '/'")
+            raise ValueError(
+                f"{path}: {suffix} holds one mesh, got {len(shot.vertices)} frames; use a folder: end the path in '/'"
+            )
         meshes.write(path, shot.vertices[0], shot.faces)
     else:
         known = ".glb .html .webp .gif .mp4 .png .npz .ply .obj, or a folder ending in '/'"
@@ -103,7 +105,7 @@ def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
 
 
 def _label(frame: int, captions) -> str:
-    """The frame's number, counted from 1, and the caption that holds there."""
+    """Return the frame's number, from 1, and its caption."""
     return ": ".join([str(frame + 1)] + [text for start, text in captions if start <= frame][-1:])
 
 

@@ -1,13 +1,13 @@
-"""Binary glTF 2.0 (GLB): positions and triangles of the file's largest mesh, at rest.
+"""Reader of binary glTF 2.0 (GLB): positions and triangles of the file's largest mesh, without animation.
 
-Largest is the mesh with the most triangles among those that the scene shows, the first of equals: of a face with eyes
-and teeth, the face. All its primitives are joined, positions that several of them share once, in the file's order; the
-transforms of its node and the nodes above are applied, but not those of a skinned mesh, which glTF places by its
-joints. Morph targets, skins and animations are not played. Exporters split vertices at the seams of textures, and a
-mesh comes back with these copies. glTF counts in metres, y up.
+The largest mesh is the one with the most triangles among those in the scene, the first of equals: for a face with eyes
+and teeth, the face. Its primitives are joined in the file's order, shared positions once. The transforms of its node
+and of the node's ancestors are applied, except for a skinned mesh, which glTF places by its joints. Morph targets,
+skins and animations are ignored. Vertices that an exporter duplicated at texture seams remain duplicated. The unit of
+glTF is the metre, y up.
 
-Functions raise plain ValueError; `meshes.read` adds the file's name. Chunks, views and accessors are held against the
-bytes that are there before memory is taken. Sections of the specification are named as (3.6.2).
+Functions raise plain ValueError; `meshes.read` adds the file's name. Chunks, views and accessors are checked against
+the file size before memory is allocated. Numbers in parentheses, such as (3.6.2), are sections of the specification.
 """
 
 import json
@@ -17,39 +17,39 @@ from pathlib import Path
 
 import numpy as np
 
-_JSON_LIMIT = 2**25  # bytes; a face with a minute of animation takes a quarter of a megabyte
-_MOST = 2**23  # vertices, or corners of triangles
+_MAX_JSON_BYTES = 2**25  # a face with a minute of animation takes a quarter of a megabyte
+_MAX_COUNT = 2**23  # vertices, or corners of triangles
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC3": 3}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _LISTS = ("scenes", "nodes", "meshes", "accessors", "bufferViews", "buffers")
-# Required extensions that change no position beyond what accessors say; compression, for one, does.
-_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
+# Required extensions that do not affect positions; compression, for example, does.
+_SUPPORTED_EXTENSIONS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (N, 3) float64 and faces (F, 3) int64 of a GLB file."""
+    """Read vertices (N, 3) float64 and faces (F, 3) int64. Raises `ValueError` for a damaged file."""
     document, binary = _chunks(path.read_bytes())
     try:
-        foreign = [x for x in document.get("extensionsRequired", []) if not x.startswith(_HARMLESS)]
+        foreign = [x for x in document.get("extensionsRequired", []) if not x.startswith(_SUPPORTED_EXTENSIONS)]
         if foreign:
-            raise ValueError(f"requires the extension {foreign[0]}, which cannot be read: export without it")
+            raise ValueError(f"unsupported extension {foreign[0]}: export without it")
         for key in _LISTS:
             items = document.setdefault(key, [])
             if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
                 raise ValueError(f"{key} must be a list of objects")
-        # Transforms of a hostile file overflow; a vertex that is not finite is refused later.
+        # Transforms in a hostile file may overflow; the caller rejects vertices that are not finite.
         with np.errstate(all="ignore"):
             mesh, matrix = _largest(document)
             vertices, faces = _join(document, binary, mesh)
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            # A mirrored mesh turns its triangles over (3.7.4).
+            # A mirroring transform reverses the orientation of triangles (3.7.4).
             mirrored = np.linalg.det(matrix[:3, :3]) < 0
     except KeyError as error:
-        raise ValueError(f"is not in order as glTF: {error} is missing") from error
+        raise ValueError(f"invalid glTF: {error} is missing") from error
     except (TypeError, AttributeError, IndexError, OverflowError) as error:
-        raise ValueError(f"is not in order as glTF: {error}") from error
+        raise ValueError(f"invalid glTF: {error}") from error
     return vertices, faces[:, ::-1] if mirrored else faces
 
 
@@ -59,7 +59,7 @@ def _chunks(data: bytes) -> tuple[dict, bytes]:
         raise ValueError("is not a GLB file (no header)")
     version, size = struct.unpack_from("<II", data, 4)
     if version != 2:
-        raise ValueError(f"is glTF version {version}; expected 2")
+        raise ValueError(f"unsupported glTF version {version}, expected 2")
     if size != len(data):
         raise ValueError(f"header claims {size} bytes, the file holds {len(data)}")
     chunks, at = [], 12
@@ -72,8 +72,10 @@ def _chunks(data: bytes) -> tuple[dict, bytes]:
         chunks.append((kind, at + 8, length))
         at += 8 + length
     kind, at, length = chunks[0]
-    if kind != _JSON or length > _JSON_LIMIT:
-        raise ValueError(f"first chunk must be JSON of at most {_JSON_LIMIT} bytes, got type {kind:#x}, {length} bytes")
+    if kind != _JSON or length > _MAX_JSON_BYTES:
+        raise ValueError(
+            f"first chunk must be JSON of at most {_MAX_JSON_BYTES} bytes, got type {kind:#x}, {length} bytes"
+        )
     try:
         document = json.loads(data[at : at + length].decode("utf-8"))
     except (ValueError, RecursionError) as error:
@@ -87,42 +89,42 @@ def _chunks(data: bytes) -> tuple[dict, bytes]:
 
 
 def _largest(document: dict) -> tuple[dict, np.ndarray]:
-    """The mesh with the most triangles and its matrix (4, 4) to the scene."""
+    """Return the mesh with the most triangles, and its transform (4, 4) to the scene."""
     meshes = document["meshes"]
     counts = [_count(document, mesh) for mesh in meshes]
-    # A file without nodes is a library of meshes, each in its own place.
+    # A file without nodes is a library of meshes without transforms.
     shown = list(_instances(document)) if document["nodes"] else [(i, np.eye(4)) for i in range(len(meshes))]
-    best, matrix = max(shown, key=lambda entry: counts[entry[0]], default=(-1, None))
+    best, matrix = max(shown, key=lambda entry: counts[entry[0]], default=(-1, np.eye(4)))
     if best < 0 or not counts[best]:
         raise ValueError("holds no triangles")
-    if counts[best] > _MOST // 3:
-        raise ValueError(f"claims {counts[best]} triangles; at most {_MOST // 3} are read")
+    if counts[best] > _MAX_COUNT // 3:
+        raise ValueError(f"claims {counts[best]} triangles; at most {_MAX_COUNT // 3} are read")
     return meshes[best], matrix
 
 
 def _instances(document: dict):
-    """(mesh, matrix) of every node of the scene that shows one, depth first (3.5.2)."""
+    """Yield (mesh, transform) of every node of the scene that has a mesh, depth first (3.5.2)."""
     nodes, scenes = document["nodes"], document["scenes"]
     if scenes:
-        roots = scenes[_whole(document.get("scene", 0), len(scenes), "scene")].get("nodes", [])
+        roots = scenes[_integer(document.get("scene", 0), len(scenes), "scene")].get("nodes", [])
     else:
         below = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in below]
     waiting, seen = [(i, np.eye(4)) for i in reversed(roots)], set()
     while waiting:
         i, above = waiting.pop()
-        node = nodes[_whole(i, len(nodes), "node")]
+        node = nodes[_integer(i, len(nodes), "node")]
         if i in seen:
-            raise ValueError(f"node {i} hangs below two others, or below itself")
+            raise ValueError(f"node {i} has two parents, or is its own ancestor")
         seen.add(i)
         matrix = above @ _matrix(node)
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
         if "mesh" in node:
-            yield _whole(node["mesh"], len(document["meshes"]), "mesh"), np.eye(4) if "skin" in node else matrix
+            yield _integer(node["mesh"], len(document["meshes"]), "mesh"), np.eye(4) if "skin" in node else matrix
 
 
 def _matrix(node: dict) -> np.ndarray:
-    """A node's own transform: its matrix by columns, or translation * rotation * scale (3.5.2)."""
+    """Return a node's local transform: its matrix by columns, or translation * rotation * scale (3.5.2)."""
     if "matrix" in node:
         return np.array(_floats(node["matrix"], 16, "matrix")).reshape(4, 4).T
     matrix = np.eye(4)
@@ -138,7 +140,7 @@ def _matrix(node: dict) -> np.ndarray:
 
 
 def _count(document: dict, mesh: dict) -> int:
-    """Triangles of a mesh, by its accessors' own account."""
+    """Return the number of triangles of a mesh that its accessors declare."""
     total = 0
     for primitive in mesh["primitives"]:
         if _drawn(primitive):
@@ -148,7 +150,7 @@ def _count(document: dict, mesh: dict) -> int:
 
 
 def _drawn(primitive: dict) -> bool:
-    """Whether it is made of triangles, not of points or lines, and says where they lie."""
+    """Return whether a primitive has positions, and consists of triangles, not of points or lines."""
     return primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN) and "POSITION" in primitive["attributes"]
 
 
@@ -160,8 +162,8 @@ def _join(document: dict, binary: bytes, mesh: dict) -> tuple[np.ndarray, np.nda
         where = primitive["attributes"]["POSITION"]
         count = _accessor(document, where)["count"]
         if where not in first:
-            if total + count > _MOST:
-                raise ValueError(f"claims more than {_MOST} vertices")
+            if total + count > _MAX_COUNT:
+                raise ValueError(f"claims more than {_MAX_COUNT} vertices")
             parts.append(_values(document, binary, where, "VEC3"))
             first[where] = total
             total += count
@@ -169,16 +171,16 @@ def _join(document: dict, binary: bytes, mesh: dict) -> tuple[np.ndarray, np.nda
         if "indices" in primitive:
             index = _values(document, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64)
         if len(index) and index.max() >= count:
-            raise ValueError(f"a triangle names vertex {index.max()} of {count}")
+            raise ValueError(f"vertex index {index.max()} of a triangle is out of range; there are {count} vertices")
         faces.append(first[where] + _triangles(index, primitive.get("mode", _TRIANGLES)))
     return np.concatenate(parts), np.concatenate(faces)
 
 
 def _triangles(index: np.ndarray, mode: int) -> np.ndarray:
-    """Corners (F, 3) of a list, strip or fan of indices (3.7.2.1)."""
+    """Return the triangles (F, 3) of a list, strip or fan of indices (3.7.2.1)."""
     if mode == _TRIANGLES:
         if len(index) % 3:
-            raise ValueError(f"{len(index)} corners do not make triangles")
+            raise ValueError(f"{len(index)} corners, expected a multiple of 3")
         return index.reshape(-1, 3)
     if mode == _FAN:
         return np.stack([index[1:-1], index[2:], np.broadcast_to(index[:1], max(len(index) - 2, 0))], -1)
@@ -188,13 +190,13 @@ def _triangles(index: np.ndarray, mode: int) -> np.ndarray:
 
 
 def _accessor(document: dict, which) -> dict:
-    record = document["accessors"][_whole(which, len(document["accessors"]), "accessor")]
-    _whole(record["count"], _MOST + 1, "count of an accessor")
+    record = document["accessors"][_integer(which, len(document["accessors"]), "accessor")]
+    _integer(record["count"], _MAX_COUNT + 1, "count of an accessor")
     return record
 
 
 def _values(document: dict, binary: bytes, which: int, shape: str) -> np.ndarray:
-    """An accessor's values (count, columns), sparse replacements put in (3.6.2)."""
+    """Return an accessor's values (count, columns), with sparse replacements applied (3.6.2)."""
     record = _accessor(document, which)
     kind, count, columns = _kind(record), record["count"], _COLUMNS[shape]
     if record["type"] != shape or (shape == "SCALAR" and kind.kind != "u"):
@@ -205,11 +207,11 @@ def _values(document: dict, binary: bytes, which: int, shape: str) -> np.ndarray
         values = np.zeros((count, columns), kind)
     if "sparse" in record:
         sparse = record["sparse"]
-        changed = _whole(sparse["count"], count + 1, "count of a sparse accessor")
+        changed = _integer(sparse["count"], count + 1, "count of a sparse accessor")
         index_kind = _kind(sparse["indices"])
         index = _view(document, binary, sparse["indices"], index_kind, changed, 1)[:, 0]
         if index_kind.kind != "u" or (changed and index.max() >= count):
-            raise ValueError(f"accessor {which} replaces a value that is not there")
+            raise ValueError(f"accessor {which}: index of a sparse replacement is out of range")
         values[index] = _view(document, binary, sparse["values"], kind, changed, columns)
     if shape == "SCALAR":
         return values
@@ -225,23 +227,23 @@ def _kind(record: dict) -> np.dtype:
 
 
 def _view(document: dict, binary: bytes, place: dict, kind: np.dtype, count: int, columns: int) -> np.ndarray:
-    """`count` rows at a place (a view and an offset in it) of the binary chunk."""
+    """Return `count` rows of the binary chunk at a place: a view and an offset in it."""
     views, buffers = document["bufferViews"], document["buffers"]
-    view = views[_whole(place["bufferView"], len(views), "bufferView")]
-    if _whole(view["buffer"], len(buffers), "buffer") != 0 or "uri" in buffers[0]:
-        raise ValueError("keeps its data in another file, which is not read: export as one GLB")
-    start, offset = (_whole(x.get("byteOffset", 0), len(binary) + 1, "byteOffset") for x in (view, place))
-    length, row = _whole(view["byteLength"], len(binary) - start + 1, "byteLength of a view"), columns * kind.itemsize
-    stride = _whole(view.get("byteStride", row), 253, "byteStride")
+    view = views[_integer(place["bufferView"], len(views), "bufferView")]
+    if _integer(view["buffer"], len(buffers), "buffer") != 0 or "uri" in buffers[0]:
+        raise ValueError("data in external files is not supported: export as one GLB")
+    start, offset = (_integer(x.get("byteOffset", 0), len(binary) + 1, "byteOffset") for x in (view, place))
+    length, row = _integer(view["byteLength"], len(binary) - start + 1, "byteLength of a view"), columns * kind.itemsize
+    stride = _integer(view.get("byteStride", row), 253, "byteStride")
     need = offset + (count - 1) * stride + row if count else 0
     if stride < row or need > length:
         raise ValueError(f"an accessor of {count} rows, {stride} bytes each, needs {need} bytes of a view of {length}")
     return np.ndarray((count, columns), kind, binary, start + offset if count else 0, (stride, kind.itemsize))
 
 
-def _whole(value, limit: int, what: str) -> int:
+def _integer(value, limit: int, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
-        raise ValueError(f"{what} must be a whole number below {limit}, got {str(value)[:40]}")
+        raise ValueError(f"{what} must be an integer in 0..{limit - 1}, got {str(value)[:40]}")
     return value
 
 

@@ -1,7 +1,7 @@
-"""Animated faces as binary glTF 2.0 (GLB), for Blender, three.js, Unreal and any other viewer.
+"""Writer of animated faces as binary glTF 2.0 (GLB), for Blender, three.js, Unreal and other viewers.
 
-Frame 0 is the mesh; every later frame is a morph target (its displacement from frame 0), and one animation
-turns the weights from target to target. glTF counts in metres.
+Frame 0 is the mesh; every later frame is a morph target (its displacement from frame 0), and one animation sets the
+weights of the targets one after another. The unit of glTF is the metre.
 """
 
 import json
@@ -30,21 +30,21 @@ def write(
     captions=(),
     extras=(),
 ) -> None:
-    """Writes one animation, atomically.
+    """Write one animation, atomically.
 
     Args:
-      path: the file, usually `.glb`.
+      path: the file.
       vertices: (T, N, 3) mm, or (N, 3) for a still face.
       faces: (F, 3).
       fps: frames per second.
-      normals: store smooth normals for every frame; without them viewers draw facets, in half of the bytes.
-      sparse: store only the vertices that move, in each target where that is smaller.
+      normals: store smooth normals for every frame; without them viewers use flat shading; halves the file size.
+      sparse: store only the vertices that move, for each target where that is smaller.
       name: of the mesh and its node.
-      captions: ((first frame, text), ...), kept in the animation's `extras` field.
-      extras: parts beside the face, see `scene.Part`.
+      captions: ((first frame, text), ...), stored in the animation's `extras` field.
+      extras: further parts, see `scene.Part`.
 
     Raises:
-      ValueError: the scene is out of order, or has no triangle.
+      ValueError: arrays have wrong shapes, a part has no triangle, or the file would exceed 4 GiB.
     """
     film = scene.make(vertices, faces, fps=fps, captions=captions, extras=extras)
     for label, triangles in [
@@ -57,8 +57,8 @@ def write(
         temporary.write_bytes(_glb(*_document(film, str(name), normals, sparse)))
 
 
-class _Store:
-    """Collects arrays into one buffer and their descriptions into glTF's lists."""
+class _Buffers:
+    """Buffer, views and accessors of a glTF document."""
 
     def __init__(self):
         self.data = bytearray()
@@ -73,7 +73,7 @@ class _Store:
         return len(self.views) - 1
 
     def accessor(self, array: np.ndarray, target: int | None = None, *, sparse=False) -> int:
-        """Index of an accessor for (n,) or (n, 3) values, float32 or unsigned."""
+        """Add values (n,) or (n, 3), float32 or unsigned, and return the index of their accessor."""
         kind = {"f4": _FLOAT, "u2": _UINT16, "u4": _UINT32}[array.dtype.str[1:]]
         columns = array.reshape(len(array), -1)
         record = {"componentType": kind, "count": len(array), "type": _SHAPES[columns.shape[1]]}
@@ -81,8 +81,7 @@ class _Store:
         moved = np.flatnonzero(columns.any(1)) if sparse else np.arange(len(array))
         index = moved.astype(_index_type(len(array)))
         if index.nbytes + array[moved].nbytes < array.nbytes:
-            # Without a view of its own the array starts as zeros; a target in which nothing moves is just
-            # that.
+            # An accessor without a view is zero; so is a target in which nothing moves.
             if len(moved):
                 record["sparse"] = {
                     "count": len(moved),
@@ -99,14 +98,14 @@ class _Store:
 
 
 def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tuple[dict, bytes]:
-    store, count = _Store(), len(film.vertices)
+    buffers, count = _Buffers(), len(film.vertices)
     skin = scene.Part(film.vertices, film.faces, np.asarray(scene.SKIN, np.float32), 0.3)
     meshes, materials, moving = [], [], []
     for i, part in enumerate([skin, *film.extras]):
         label = name if i == 0 else f"{name} part {i}"
         if part.vertices.ndim == 3 and len(part.vertices) > 1:
             moving.append(i)
-        meshes.append(_mesh(store, part, label, i, normals, sparse))
+        meshes.append(_mesh(buffers, part, label, i, normals, sparse))
         materials.append(_material(part, label))
     document = {
         "asset": {"version": "2.0", "generator": "facejax"},
@@ -117,9 +116,9 @@ def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tupl
         "materials": materials,
     }
     if moving:
-        times = store.accessor((np.arange(count) / film.fps).astype(np.float32))
+        times = buffers.accessor((np.arange(count) / film.fps).astype(np.float32))
         # At key t the weight of target t - 1 is one; frame 0 has none.
-        weights = store.accessor(np.eye(count, dtype=np.float32)[:, 1:].ravel())
+        weights = buffers.accessor(np.eye(count, dtype=np.float32)[:, 1:].ravel())
         document["animations"] = [
             {
                 "name": "expression",
@@ -128,30 +127,33 @@ def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tupl
                 "extras": {"fps": film.fps, "captions": [list(caption) for caption in film.captions]},
             }
         ]
-    store.data += bytes(-len(store.data) % 4)
-    document["buffers"] = [{"byteLength": len(store.data)}]
-    document["bufferViews"], document["accessors"] = store.views, store.accessors
-    return document, bytes(store.data)
+    buffers.data += bytes(-len(buffers.data) % 4)
+    document["buffers"] = [{"byteLength": len(buffers.data)}]
+    document["bufferViews"], document["accessors"] = buffers.views, buffers.accessors
+    return document, bytes(buffers.data)
 
 
-def _mesh(store: _Store, part: scene.Part, name: str, material: int, normals: bool, sparse: bool) -> dict:
+def _mesh(buffers: _Buffers, part: scene.Part, name: str, material: int, normals: bool, sparse: bool) -> dict:
     frames = part.vertices if part.vertices.ndim == 3 else part.vertices[None]
     columns = {"POSITION": (frames / np.float32(1000)).astype(np.float32)}
     if normals:
         columns["NORMAL"] = scene.normals(frames, part.faces).astype(np.float32)
-    attributes = {key: store.accessor(column[0], _VERTEX_DATA) for key, column in columns.items()}
+    attributes = {key: buffers.accessor(column[0], _VERTEX_DATA) for key, column in columns.items()}
     if np.ndim(part.colour) == 2:
-        attributes["COLOR_0"] = store.accessor(shading.linear(part.colour), _VERTEX_DATA)
+        attributes["COLOR_0"] = buffers.accessor(shading.linear(np.asarray(part.colour)), _VERTEX_DATA)
     index = part.faces.ravel().astype(_index_type(frames.shape[1]))
     primitive = {
         "attributes": attributes,
-        "indices": store.accessor(index, _INDEX_DATA),
+        "indices": buffers.accessor(index, _INDEX_DATA),
         "material": material,
     }
     mesh = {"name": name, "primitives": [primitive]}
     if len(frames) > 1:
         primitive["targets"] = [
-            {key: store.accessor(column[t] - column[0], _VERTEX_DATA, sparse=sparse) for key, column in columns.items()}
+            {
+                key: buffers.accessor(column[t] - column[0], _VERTEX_DATA, sparse=sparse)
+                for key, column in columns.items()
+            }
             for t in range(1, len(frames))
         ]
         mesh["weights"] = [0.0] * (len(frames) - 1)
@@ -160,7 +162,7 @@ def _mesh(store: _Store, part: scene.Part, name: str, material: int, normals: bo
 
 
 def _material(part: scene.Part, name: str) -> dict:
-    colour = shading.linear(part.colour).tolist() if np.ndim(part.colour) == 1 else [1.0, 1.0, 1.0]
+    colour = shading.linear(np.asarray(part.colour)).tolist() if np.ndim(part.colour) == 1 else [1.0, 1.0, 1.0]
     surface = {
         "baseColorFactor": [*colour, 1.0],
         "metallicFactor": 0.0,
@@ -170,7 +172,7 @@ def _material(part: scene.Part, name: str) -> dict:
 
 
 def _index_type(size: int) -> type:
-    # The greatest number of a type is glTF's primitive restart and names no vertex.
+    # The largest value of a type is glTF's primitive restart, not a vertex.
     return np.uint16 if size < 0xFFFF else np.uint32
 
 

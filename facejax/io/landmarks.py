@@ -1,14 +1,15 @@
-"""Landmarks of a mesh in the files that people have them in.
+"""Readers of landmark files in several formats, and a writer.
 
-  .json   `{"indices": [...]}` vertices from 0 on; `{"faces": [...], "weights": [[a, b, c], ...]}` barycentric, the
-          triangle's corners in order; `{"points": [[x, y, z], ...]}`; or a bare list of indices or of points. `names`
-          may stand beside them, other keys are passed over.
+  .json   `{"indices": [...]}` vertex indices from 0; `{"faces": [...], "weights": [[a, b, c], ...]}` barycentric, in
+          the order of the triangle's corners; `{"points": [[x, y, z], ...]}`; or a bare list of indices or points.
+          `names` is optional, other keys are ignored.
   .pp     MeshLab's PickedPoints: XML, one `<point x= y= z= name= active=>` each.
-  .txt .csv .xyz .lnd .bnd   one landmark a line: `index`, `x y z`, or `index x y z` as in BU-4DFE, all lines alike;
-          blanks, commas or semicolons between, `#` begins a comment, blank lines are passed over.
-  .npy .npz .pkl   FLAME's embedding (`facejax.io.embedding`), on a mesh with FLAME's triangles.
+  .txt .csv .xyz .lnd .bnd   one landmark per line: `index`, `x y z`, or `index x y z` as in BU-4DFE, the same in all
+          lines; separated by blanks, commas or semicolons; `#` begins a comment, blank lines are ignored.
+  .npy .npz .pkl   FLAME's embedding (`facejax.io.flame_embedding`), for a mesh with FLAME's triangles.
 
-Landmarks are in the mesh's own unit. A file is a claim to be checked: sizes are bounded, and XML may declare nothing.
+Positions are in the mesh's unit. Files may be untrusted: sizes are bounded, and declarations in XML are rejected.
+L landmarks, N vertices, F triangles.
 """
 
 import json
@@ -21,38 +22,39 @@ from xml.parsers import expat
 
 import numpy as np
 
-from facejax.io import atomic, flame_embedding
+from facejax.io import atomic, errors, flame_embedding
 
-MAX_BYTES = 2**22  # bytes of a file
-MAX_LANDMARKS = 10_000  # landmarks
-VERTEX_TOLERANCE = 1e-3  # of the mesh's diagonal: a vertex and the position written beside its number
+MAX_BYTES = 2**22
+MAX_LANDMARKS = 10_000
+VERTEX_TOLERANCE = 1e-3  # between a vertex and the position beside its index, relative to the mesh's diagonal
 _KINDS = (("indices",), ("faces", "weights"), ("points",))
-_ROWS = {1: "index", 3: "x y z", 4: "index x y z"}
+_ROW_FORMATS = {1: "index", 3: "x y z", 4: "index x y z"}
 
 
-class LandmarkError(atomic.FileError):
-    """A landmark file cannot be used; the message names the file, the line or entry, and what was expected."""
+class LandmarkError(errors.FileError):
+    """A landmark file cannot be used; the message names the file and the line or entry."""
 
 
 class Landmarks(NamedTuple):
     """L landmarks of one mesh."""
 
     points: np.ndarray  # (L, 3) float64, in the mesh's unit
-    index: np.ndarray | None  # (L,) int32, the vertex that each is; None where the file gives no vertices
+    # (L,) int32 vertex indices; None where the file does not contain any
+    index: np.ndarray | None  # pyright: ignore[reportIncompatibleMethodOverride]
     names: tuple[str, ...] | None = None  # (L,)
 
 
 def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
-    """Reads the landmarks of a mesh by the file's suffix.
+    """Read the landmarks of a mesh in the format of the file's suffix.
 
     Args:
       path: the file.
-      vertices: (N, 3) of the mesh; without them only files that hold positions can be read.
-      faces: (F, 3) of the mesh; barycentric landmarks need them.
+      vertices: (N, 3) of the mesh; without them only files of positions can be read.
+      faces: (F, 3) of the mesh; required for barycentric landmarks.
 
     Raises:
-      LandmarkError: the file is missing, too large or damaged; a number is not finite; an index is not of this mesh; a
-        position lies far off the mesh, or not at the vertex that is named beside it.
+      LandmarkError: the file is missing, too large or damaged; a number is not finite; an index is out of range; a
+        position is far from the mesh, or not at the vertex whose index is beside it.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -67,7 +69,7 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
             raise LandmarkError(f"{path}: {size} bytes; expected 1 to {MAX_BYTES}")
         found = reader(path if reader is _read_embedding else path.read_bytes(), mesh, faces)
         if mesh is not None:
-            _near(found.points, mesh)
+            _check_distance(found.points, mesh)
     except LandmarkError:
         raise
     except OSError as error:
@@ -78,20 +80,20 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
 
 
 def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> None:
-    """Writes vertex indices (L,) or positions (L, 3), and names if given, as .json, atomically; read back exactly.
+    """Write vertex indices (L,) or positions (L, 3), and optional names (L,), as .json, atomically and without loss.
 
     Raises:
-      ValueError: another suffix, or not exactly one of the two, or a wrong shape.
+      ValueError: the suffix is not .json, not exactly one of `index` and `points` is given, or a shape is wrong.
     """
     path = Path(path)
     if path.suffix.lower() != ".json":
         raise ValueError(f"{path}: landmarks are written as .json, got {path.suffix!r}")
     if (index is None) == (points is None):
-        raise ValueError(f"{path}: expected either index or points")
+        raise ValueError(f"{path}: expected either index or points, not both or none")
     if points is None:
         values = np.asarray(index)
         if values.ndim != 1 or not len(values) or values.dtype.kind not in "iu" or values.min() < 0:
-            raise ValueError(f"{path}: index must be (L,) integers from 0 on, got {values.shape} {values.dtype}")
+            raise ValueError(f"{path}: index must be (L,) integers of 0 or more, got {values.shape} {values.dtype}")
     else:
         values = np.asarray(points, np.float64)
         if values.ndim != 2 or values.shape[1] != 3 or not len(values) or not np.isfinite(values).all():
@@ -107,9 +109,9 @@ def _read_json(data: bytes, mesh, faces) -> Landmarks:
     try:
         record = json.loads(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise ValueError("is not UTF-8 text") from None
+        raise ValueError("not UTF-8 text") from None
     except (json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"is not JSON: {error}") from None
+        raise ValueError(f"not JSON: {error}") from None
     if isinstance(record, list):
         record = {"points" if record and isinstance(record[0], list) else "indices": record}
     kinds = [kind for kind in _KINDS if isinstance(record, dict) and any(key in record for key in kind)]
@@ -124,36 +126,36 @@ def _read_json(data: bytes, mesh, faces) -> Landmarks:
         points = [_numbers(v, f"points[{i}]") for i, v in enumerate(rows[0])]
         found = Landmarks(np.array(points, np.float64), None)
     else:
-        found = Landmarks(_on_faces(*rows, mesh, faces), None)
+        found = Landmarks(_from_barycentric(rows[0], rows[1], mesh, faces), None)
     if "names" in record:
         found = found._replace(names=tuple(_names(record["names"], len(found.points))))
     return found
 
 
-def _on_faces(face: list, weights: list, mesh, faces) -> np.ndarray:
-    """Positions (L, 3) of barycentric landmarks."""
+def _from_barycentric(face: list, weights: list, mesh, faces) -> np.ndarray:
+    """Return the positions (L, 3) of barycentric landmarks."""
     if len(face) != len(weights):
         raise ValueError(f"{len(face)} faces but {len(weights)} weights")
     table = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(weights)], np.float64)
-    return _placed(face, table, mesh, faces)
+    return _interpolate(face, table, mesh, faces)
 
 
-def _placed(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
+def _interpolate(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
     if mesh is None or faces is None:
-        raise ValueError("landmarks on faces need the mesh's vertices and faces")
+        raise ValueError("barycentric landmarks need the mesh's vertices and faces")
     faces = np.asarray(faces)
-    which = [_whole(v, f"faces[{i}]", len(faces), "triangles") for i, v in enumerate(face)]
+    index = [_integer(v, f"faces[{i}]", len(faces), "triangles") for i, v in enumerate(face)]
     bad = np.flatnonzero(~(np.abs(weights.sum(1) - 1) <= 1e-3))
     if len(bad):
         raise ValueError(f"weights[{bad[0]}]: expected a sum of 1, got {weights[bad[0]].tolist()}")
-    return np.einsum("lk,lkx->lx", weights, mesh[faces[which]])
+    return np.einsum("lk,lkx->lx", weights, mesh[faces[index]])
 
 
 def _read_embedding(path: Path, mesh, faces) -> Landmarks:
     face, weights = flame_embedding.read(path)
     if not 0 < len(face) <= MAX_LANDMARKS:
         raise ValueError(f"expected 1 to {MAX_LANDMARKS} landmarks, got {len(face)}")
-    return Landmarks(_placed(face.tolist(), weights, mesh, faces), None)
+    return Landmarks(_interpolate(face.tolist(), weights, mesh, faces), None)
 
 
 def _read_pp(data: bytes, mesh, faces) -> Landmarks:
@@ -168,29 +170,28 @@ def _read_pp(data: bytes, mesh, faces) -> Landmarks:
         if tag != "point":
             return
         name = attributes.get("name", str(len(points)))
-        # MeshLab keeps a point that was named but not picked; leaving it out would renumber all that follow.
+        # MeshLab keeps points that are named but not picked; skipping one would renumber all that follow.
         if attributes.get("active", "1") == "0":
-            raise ValueError(f"{line}: point {name[:40]!r} is not active: pick it, or delete it")
+            raise ValueError(f"{line}: point {name[:40]!r} is not active: pick it or delete it in MeshLab")
         missing = [axis for axis in "xyz" if axis not in attributes]
         if missing:
             raise ValueError(f"{line}: point {name[:40]!r} lacks {missing[0]}")
         points.append([_number(attributes[axis], line) for axis in "xyz"])
         names.append(name)
 
-    # MeshLab itself begins with a bare <!DOCTYPE PickedPoints>. Anything that a declaration could bring along (entities
-    # to expand, files to fetch) is refused.
+    # MeshLab writes a bare <!DOCTYPE PickedPoints>. Declarations could expand entities or read files: rejected.
     def doctype(name, system, public, has_subset):
         if system or public or has_subset:
-            raise ValueError(f"line {parser.CurrentLineNumber}: a DOCTYPE with declarations is refused")
+            raise ValueError(f"line {parser.CurrentLineNumber}: a DOCTYPE with declarations is not allowed")
 
     def entity(*_):
-        raise ValueError(f"line {parser.CurrentLineNumber}: entities are refused")
+        raise ValueError(f"line {parser.CurrentLineNumber}: entities are not allowed")
 
     parser.StartElementHandler, parser.StartDoctypeDeclHandler, parser.EntityDeclHandler = start, doctype, entity
     try:
         parser.Parse(data, True)
     except (expat.ExpatError, LookupError) as error:
-        raise ValueError(f"is not XML: {error}") from None
+        raise ValueError(f"not XML: {error}") from None
     return Landmarks(np.array(_list(points, "points"), np.float64), None, tuple(names))
 
 
@@ -202,25 +203,31 @@ def _read_text(data: bytes, mesh, faces) -> Landmarks:
             continue
         where = f"line {number}"
         form = len(words) if form is None else form
-        if len(words) != form or form not in _ROWS:
-            wanted = f"`{_ROWS[form]}` as before" if form in _ROWS else ", ".join(f"`{row}`" for row in _ROWS.values())
+        if len(words) != form or form not in _ROW_FORMATS:
+            formats = ", ".join(f"`{row}`" for row in _ROW_FORMATS.values())
+            wanted = f"`{_ROW_FORMATS[form]}` as before" if form in _ROW_FORMATS else formats
             raise ValueError(f"{where}: expected {wanted}, got {len(words)} columns: {line.strip()[:60]!r}")
         if form != 3:
             if not re.fullmatch(r"[0-9]{1,9}", words[0]):
-                raise ValueError(f"{where}: expected a vertex's number from 0 on, got {words[0][:40]!r}")
+                raise ValueError(f"{where}: expected a vertex index of 0 or more, got {words[0][:40]!r}")
             index.append(_index(int(words[0]), where, mesh) if form == 1 or mesh is not None else int(words[0]))
         if form != 1:
             points.append([_number(word, where) for word in words[-3:]])
-            if form == 4 and mesh is not None and math.dist(points[-1], mesh[index[-1]]) > VERTEX_TOLERANCE * _diagonal(mesh):
-                raise ValueError(
-                    f"{where}: vertex {index[-1]} lies at {mesh[index[-1]].tolist()}, not at {points[-1]}: these are "
-                    "landmarks of another mesh"
-                )
+            if form == 4 and mesh is not None:
+                vertex = mesh[index[-1]]
+                if math.dist(points[-1], vertex) > VERTEX_TOLERANCE * _diagonal(mesh):
+                    raise ValueError(
+                        f"{where}: vertex {index[-1]} is at {vertex.tolist()}, not at {points[-1]}: the landmarks "
+                        "belong to another mesh"
+                    )
         if max(len(index), len(points)) > MAX_LANDMARKS:
             raise ValueError(f"{where}: more than {MAX_LANDMARKS} landmarks")
     _list(index or points, "landmarks")
     numbers = np.array(index, np.int32) if index else None
-    return Landmarks(np.array(points, np.float64) if points else mesh[numbers], numbers)
+    if points:
+        return Landmarks(np.array(points, np.float64), numbers)
+    assert mesh is not None  # `_index` raises without one
+    return Landmarks(mesh[numbers], numbers)
 
 
 def _list(values, what: str) -> list:
@@ -232,13 +239,13 @@ def _list(values, what: str) -> list:
 
 def _names(values, count: int) -> list[str]:
     if not isinstance(values, list) or len(values) != count or not all(isinstance(v, str) for v in values):
-        raise ValueError(f"names: expected {count} texts, one for each landmark")
+        raise ValueError(f"names: expected {count} strings, one for each landmark")
     return values
 
 
-def _whole(value, where: str, count: int, what: str) -> int:
+def _integer(value, where: str, count: int, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"{where}: expected a whole number, got {str(value)[:40]!r}")
+        raise ValueError(f"{where}: expected an integer, got {str(value)[:40]!r}")
     if not 0 <= value < count:
         raise ValueError(f"{where}: {str(value)[:40]} is out of range; {what} are 0..{count - 1}")
     return value
@@ -246,8 +253,8 @@ def _whole(value, where: str, count: int, what: str) -> int:
 
 def _index(value, where: str, mesh) -> int:
     if mesh is None:
-        raise ValueError("landmarks given as vertices need the mesh's vertices")
-    return _whole(value, where, len(mesh), "vertices")
+        raise ValueError("landmarks given as vertex indices need the mesh's vertices")
+    return _integer(value, where, len(mesh), "vertices")
 
 
 def _numbers(value, where: str) -> list[float]:
@@ -261,19 +268,19 @@ def _number(value, where: str) -> float:
         number = math.nan if isinstance(value, (bool, list, dict)) or value is None else float(value)
     except (ValueError, OverflowError):
         number = math.nan
-    # Half of the greatest number, so that distances stay finite.
+    # The square root of the largest float, so that squared distances are finite.
     if not abs(number) < 1e150:
         raise ValueError(f"{where}: expected a finite number, got {str(value)[:40]!r}")
     return number
 
 
-def _near(points: np.ndarray, mesh: np.ndarray) -> None:
+def _check_distance(points: np.ndarray, mesh: np.ndarray) -> None:
     middle, diagonal = (mesh.min(0) + mesh.max(0)) / 2, _diagonal(mesh)
     distance = np.linalg.norm(points - middle, axis=1)
     far = int(np.argmax(distance))
     if distance[far] > max(diagonal, 1e-12):
         raise ValueError(
-            f"landmark {far} lies {distance[far]:.3g} from the middle of a mesh whose diagonal is {diagonal:.3g}: "
+            f"landmark {far} is {distance[far]:.3g} away from the centre of a mesh whose diagonal is {diagonal:.3g}: "
             "another unit, or another mesh?"
         )
 
@@ -282,10 +289,10 @@ def _diagonal(mesh: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(mesh, axis=0)))
 
 
-_TEXTS = (".txt", ".csv", ".xyz", ".lnd", ".bnd")
+_TEXT_SUFFIXES = (".txt", ".csv", ".xyz", ".lnd", ".bnd")
 _READERS = {
     ".json": _read_json,
     ".pp": _read_pp,
-    **dict.fromkeys(_TEXTS, _read_text),
+    **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
     **dict.fromkeys(flame_embedding.SUFFIXES, _read_embedding),
 }

@@ -1,48 +1,44 @@
-"""Triangle meshes in PLY, OBJ, GLB, NPZ and NPY files.
+"""Readers and writers of triangle meshes in PLY, OBJ, GLB, NPZ and NPY files.
 
-Vertex order is kept exactly; polygons are cut into fans; everything but positions and faces is ignored. A
-file is a claim to be checked: counts are held against the bytes that are there before memory is taken, and
-nothing is unpickled.
+The vertex order is preserved; polygons become triangle fans; everything but positions and faces is ignored. Files may
+be untrusted: counts are checked against the file size before memory is allocated, and nothing is unpickled.
 """
 
 import array
 import os
 import re
-import shutil
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from facejax.io import atomic, glb_reader, npz, ply
+from facejax.io import atomic, errors, glb_reader, npz, ply
 from facejax.io.npz import DAMAGE_ERRORS, MAX_BYTES
 
-_TEXT_LIMIT = 2**26  # bytes of an OBJ
-_LINE_LIMIT = 2**20
-_FRAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
+_MAX_OBJ_BYTES = 2**26
+_MAX_LINE_CHARS = 2**20
+_FRAME_NAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
 
 
-class MeshError(atomic.FileError):
-    """A mesh file cannot be used; the message names the file, what is wrong and where."""
+class MeshError(errors.FileError):
+    """A mesh file cannot be used; the message names the file, the problem and its location."""
 
 
 class Mesh(NamedTuple):
-    """vertices: (N, 3) float64, in the file's unit. faces: (F, 3) int32, or None."""
+    """A triangle mesh."""
 
-    vertices: np.ndarray
-    faces: np.ndarray | None
+    vertices: np.ndarray  # (N, 3) float64, in the file's unit
+    faces: np.ndarray | None  # (F, 3) int32
 
 
 def read(path: str | os.PathLike) -> Mesh:
-    """Reads a mesh by the file's suffix: .ply, .obj, .glb, .npz (`vertices`, optional `faces`) or .npy (vertices).
+    """Read a mesh; the suffix is .ply, .obj, .glb, .npz (`vertices`, optional `faces`) or .npy (vertices).
 
-    Of a .glb, which counts in metres, the largest mesh is taken, at rest: see `facejax.io.glb`.
+    Of a .glb, whose unit is the metre, the largest mesh is read, without animation: see `facejax.io.glb_reader`.
 
     Raises:
-      MeshError: the file is missing, unreadable, cut short, empty or not a mesh; a vertex is not finite; a
-      face names
-        a vertex that is not there.
+      MeshError: the file is missing, truncated, empty or not a mesh; a vertex is not finite; a vertex index is out of
+        range.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -67,18 +63,25 @@ def read(path: str | os.PathLike) -> Mesh:
 
 
 def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.ndarray, np.ndarray | None, dict]:
-    """Reads an NPZ of `vertices` (T, N, 3) or (N, 3) and `faces`; and what else it holds of `landmarks` and `fps`.
+    """Read an NPZ of `vertices` (T, N, 3) or (N, 3) and `faces`, and optional `landmarks` and `fps`.
 
-    `bare`: it may lack faces, which are None then. Frames after the first are not looked at.
+    Only the first frame is checked.
+
+    Args:
+      path: the file.
+      bare: allow a file without faces, and return None for them.
+
+    Returns:
+      vertices, faces (F, 3) int32, and a dict with those of "landmarks" and "fps" that the file contains.
 
     Raises:
       MeshError: as `read`.
     """
     path = Path(path)
-    found = _told(path, npz.read_npz, ("vertices", "faces", "landmarks", "fps"))
+    found = _as_mesh_error(path, npz.read_npz, ("vertices", "faces", "landmarks", "fps"))
     vertices, faces = found.pop("vertices"), found.pop("faces", None)
     if faces is None and not bare:
-        raise MeshError(f"{path}: has no triangles, nothing to show")
+        raise MeshError(f"{path}: has no triangles")
     if vertices.ndim not in (2, 3) or 0 in vertices.shape:
         raise MeshError(f"{path}: vertices must be (T, N, 3) or (N, 3), got {vertices.shape}")
     first = _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
@@ -87,27 +90,31 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
         if found["fps"].size != 1 or found["fps"].dtype.kind not in "fiu":
             raise MeshError(f"{path}: fps must be one number, got {found['fps'].shape} {found['fps'].dtype}")
         extra["fps"] = float(found["fps"].item())
-    return vertices, first.faces if bare else faces.astype(np.int32), extra
+    return vertices, first.faces if bare or faces is None else faces.astype(np.int32), extra
 
 
 def count_frames(path: str | os.PathLike) -> int:
-    """How many frames an NPZ of `vertices` (T, N, 3) holds; its numbers are not read.
+    """Return the number of frames in an NPZ of `vertices` (T, N, 3), without reading them.
 
     Raises:
-      MeshError: as `read_animation`, or other `vertices`.
+      MeshError: as `read_animation`, or `vertices` have another shape.
     """
-    shape = _told(Path(path), npz.npz_shape, "vertices")
+    shape = _as_mesh_error(Path(path), npz.npz_shape, "vertices")
     if len(shape) != 3 or 0 in shape or shape[2] != 3:
         raise MeshError(f"{path}: vertices must be (T, N, 3), got {shape}")
     return shape[0]
 
 
 def write(path: str | os.PathLike, vertices, faces=None) -> None:
-    """Writes a mesh by suffix (.ply binary, .obj text, .npz), atomically; numbers come back bit for bit.
+    """Write a mesh in the format of the suffix (.ply binary, .obj text, .npz), atomically and without loss.
 
     Args:
-      vertices: (N, 3).
+      path: the file.
+      vertices: (N, 3) float32 or float64; other dtypes are converted to float64.
       faces: (F, 3) int, or None.
+
+    Raises:
+      ValueError: the suffix is unknown, or an array has another shape or dtype.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
@@ -125,35 +132,27 @@ def write(path: str | os.PathLike, vertices, faces=None) -> None:
 
 
 def write_sequence(folder: str | os.PathLike, vertices, faces, *, format="ply") -> None:
-    """Writes frames 000001.ply, 000002.ply, ... of vertices (T, N, 3) as a folder, which appears whole.
-
-    Frames of an earlier run are replaced.
+    """Write vertices (T, N, 3) as frames 000001.ply, 000002.ply, ... in a folder, which is replaced atomically.
 
     Raises:
-      ValueError: the folder holds anything but frames.
+      ValueError: the format is unknown, or the folder contains anything but frames.
     """
     folder = Path(folder)
     if f".{format}" not in _WRITERS:
         raise ValueError(f"unknown frame format {format!r}; expected ply, obj or npz")
     if folder.exists():
-        other = [entry.name for entry in folder.iterdir() if not _FRAME.fullmatch(entry.name)]
+        other = [entry.name for entry in folder.iterdir() if not _FRAME_NAME.fullmatch(entry.name)]
         if other:
-            raise ValueError(f"{folder}: holds {other[0]!r}, which is no frame; name an empty folder")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as temporary:
-        fresh = Path(temporary) / "frames"
-        fresh.mkdir()
+            raise ValueError(f"{folder}: contains {other[0]!r}, which is not a frame; use an empty folder")
+    with atomic.replace_folder(folder) as temporary:
         for t, frame in enumerate(np.asarray(vertices)):
-            write(fresh / f"{t + 1:06d}.{format}", frame, faces)
-        if folder.exists():
-            shutil.rmtree(folder)
-        os.replace(fresh, folder)
+            write(temporary / f"{t + 1:06d}.{format}", frame, faces)
 
 
 def _read_obj(path: Path):
-    if (size := path.stat().st_size) > _TEXT_LIMIT:
-        raise ValueError(f"{size} bytes of text; at most {_TEXT_LIMIT} are read: save it as binary PLY")
-    vertices, faces = array.array("d"), array.array("q")  # a list would take six times as much
+    if (size := path.stat().st_size) > _MAX_OBJ_BYTES:
+        raise ValueError(f"{size} bytes of text; at most {_MAX_OBJ_BYTES} are read: save it as binary PLY")
+    vertices, faces = array.array("d"), array.array("q")  # lists would take six times as much memory
     for number, line in _lines(path):
         kind, *rest = line.split(maxsplit=1)[:2] or [""]
         if kind not in ("v", "f") or not rest:
@@ -166,25 +165,25 @@ def _read_obj(path: Path):
                 continue
             corner = [int(field.split("/")[0]) for field in fields]
         except ValueError:
-            raise ValueError(f"line {number}: cannot be understood: {line[:60]!r}") from None
+            raise ValueError(f"line {number}: cannot be parsed: {line[:60]!r}") from None
         if len(corner) < 3 or 0 in corner:
-            raise ValueError(f"line {number}: expected 3 or more corners from 1 on: {line[:60]!r}")
-        # Negative numbers count back from the latest vertex.
+            raise ValueError(f"line {number}: expected 3 or more corners, counted from 1: {line[:60]!r}")
+        # Negative indices count back from the last vertex.
         corner = [i - 1 if i > 0 else len(vertices) // 3 + i for i in corner]
         if max(map(abs, corner)) > ply.MAX_ROWS or len(vertices) + len(faces) > 3 * ply.MAX_ROWS - 3 * len(corner):
-            raise ValueError(f"line {number}: a vertex beyond {ply.MAX_ROWS}, or more triangles; that many are read")
+            raise ValueError(f"line {number}: more than {ply.MAX_ROWS} vertices or triangles")
         for i in range(1, len(corner) - 1):
             faces.extend((corner[0], corner[i], corner[i + 1]))
     return np.frombuffer(vertices, np.float64).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
 
 
 def _lines(path: Path):
-    """Numbered lines, those that end in a backslash joined with the next."""
+    """Yield numbered lines; one that ends in a backslash is joined with the next."""
     with path.open(encoding="utf-8", errors="replace") as stream:
-        begun = ""
-        for number, line in enumerate(iter(lambda: stream.readline(_LINE_LIMIT + 1), ""), 1):
-            if len(line) > _LINE_LIMIT or len(begun) > _LINE_LIMIT:
-                raise ValueError(f"line {number}: more than {_LINE_LIMIT} characters")
+        begun, number = "", 0
+        for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE_CHARS + 1), ""), 1):
+            if len(line) > _MAX_LINE_CHARS or len(begun) > _MAX_LINE_CHARS:
+                raise ValueError(f"line {number}: more than {_MAX_LINE_CHARS} characters")
             if line.endswith("\\\n"):
                 begun += line[:-2] + " "
                 continue
@@ -203,7 +202,7 @@ def _read_npy(path: Path):
     return npz.read_npy(path), None
 
 
-def _told(path: Path, reader, *options):
+def _as_mesh_error(path: Path, reader, *options):
     try:
         return reader(path, *options)
     except FileNotFoundError:
@@ -216,13 +215,13 @@ def _checked(path: Path, vertices, faces) -> Mesh:
     vertices = np.asarray(vertices)
     if vertices.dtype.kind not in "fiu":
         raise MeshError(f"{path}: vertices must be real numbers, got {vertices.dtype}")
-    with np.errstate(invalid="ignore"):  # of numbers that are none: refused below
+    with np.errstate(invalid="ignore"):  # values that are not finite are rejected below
         vertices = vertices.astype(np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MeshError(f"{path}: vertices must be (N, 3), got {vertices.shape}")
     if not len(vertices):
-        raise MeshError(f"{path}: holds no vertices")
-    if not np.isfinite(vertices).all():  # row by row, as below, would take ten times as long
+        raise MeshError(f"{path}: contains no vertices")
+    if not np.isfinite(vertices).all():  # the check by row, as below, would take ten times as long
         bad = np.flatnonzero(~np.isfinite(vertices).all(1))
         raise MeshError(f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)")
     if faces is None or not np.size(faces):

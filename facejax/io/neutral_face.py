@@ -1,4 +1,4 @@
-"""A neutral face from a file, brought to the models' topology, millimetres, y up and z forward."""
+"""Reader of neutral faces, converted to the models' vertex order, millimetres, y up and z forward."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PLY format: text, little and big endian, any elements and properties; positions and faces are kept.
+"""The PLY format: text, little and big endian. Positions and faces are read, other elements and properties skipped.
 
 Functions raise plain ValueError; `meshes.read` adds the file's name.
 """
@@ -15,16 +15,16 @@ _TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_HEADER_LIMIT = 1 << 16
-MAX_ROWS = 1 << 23  # vertices, or triangles that the faces are cut into
-_TEXT_LIMIT = 1 << 26  # bytes of numbers as text, each of which takes up to four times as many as a number
-_RAGGED = 1 << 20  # rows of lists that differ in length: each becomes an array of its own
+_MAX_HEADER_BYTES = 1 << 16
+MAX_ROWS = 1 << 23  # vertices, or triangles
+_MAX_TEXT_BYTES = 1 << 26  # a number of two bytes of text takes eight in memory
+_MAX_RAGGED_ROWS = 1 << 20  # rows of lists of different length, each of which becomes an array of its own
 
 
 class _Property(NamedTuple):
     name: str
     kind: str
-    count: str | None  # the type of a list's length; None for a scalar
+    length_kind: str | None  # type of a list's length; None for a scalar
 
 
 class _Element(NamedTuple):
@@ -34,12 +34,12 @@ class _Element(NamedTuple):
 
 
 def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (N, 3) float64 and faces (F, 3) int64 of a PLY file."""
+    """Read vertices (N, 3) float64 and faces (F, 3) int64. Raises `ValueError` for a damaged file."""
     data = path.read_bytes()
     order, elements, start = _header(data)
-    # Text and binary differ only in where the next numbers come from.
+    # Text and binary differ only in how the next numbers are read.
     source = _Binary(data, start, order) if order else _Text(data, start)
-    with np.errstate(invalid="ignore"):  # of numbers that are none, or too large for an index: the caller refuses them
+    with np.errstate(invalid="ignore"):  # the caller rejects invalid values and indices
         return _elements(source, elements)
 
 
@@ -63,7 +63,7 @@ def _elements(source, elements: list[_Element]) -> tuple[np.ndarray, np.ndarray]
 
 
 def write(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Little-endian binary, single or double precision as the vertices are."""
+    """Write little-endian binary, in single precision for float32 vertices, else in double."""
     kind = "float" if vertices.dtype == np.float32 else "double"
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
     header += [f"property {kind} {axis}" for axis in "xyz"]
@@ -74,10 +74,10 @@ def write(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    end = data.find(b"end_header", 0, _HEADER_LIMIT)
+    end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     line_end = data.find(b"\n", end)
     if not data.startswith(b"ply") or end < 0 or line_end < 0:
-        raise ValueError("is not a PLY file (no header)")
+        raise ValueError("not a PLY file (no header)")
     order, elements = None, []
     for line in data[:end].decode("latin1").splitlines()[1:]:
         word = line.split()
@@ -95,11 +95,11 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
             else:
                 raise KeyError(word[0])
         except (KeyError, IndexError, ValueError):
-            raise ValueError(f"header line cannot be understood: {line[:60]!r}") from None
+            raise ValueError(f"header line cannot be parsed: {line[:60]!r}") from None
     if order is None:
         raise ValueError("header names no format")
     for element in elements:
-        # No number takes less than a byte, so that a false count is found before anything is made for it.
+        # Every number takes a byte or more, so that a false count is found before memory is allocated.
         if not 0 <= element.rows <= len(data):
             raise ValueError(f"header claims {element.rows} rows of {element.name} in {len(data)} bytes")
         if element.name in ("vertex", "face") and element.rows > MAX_ROWS:
@@ -108,12 +108,12 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _rows(source, element: _Element) -> dict:
-    """Columns by name: arrays for scalars and for lists of one length, Python lists for ragged ones."""
-    if all(item.count is None for item in element.properties):
+    """Return columns by name: arrays for scalars and for lists of equal length, Python lists for others."""
+    if all(item.length_kind is None for item in element.properties):
         return source.table(element, {})
     first = source.copy().one_row(element) if element.rows else {}
-    lengths = {item.name: len(first.get(item.name, ())) for item in element.properties if item.count}
-    # Nearly every file holds triangles alone: then the element is a plain table, read at once.
+    lengths = {item.name: len(first.get(item.name, ())) for item in element.properties if item.length_kind}
+    # Nearly all files contain only triangles; the element is then a table that can be read at once.
     attempt = source.copy()
     try:
         columns = attempt.table(element, lengths)
@@ -122,8 +122,8 @@ def _rows(source, element: _Element) -> dict:
     if columns is not None and all((columns[f"{name} length"] == k).all() for name, k in lengths.items()):
         source.at = attempt.at
         return columns
-    if element.rows > _RAGGED:
-        raise ValueError(f"{element.rows} rows of {element.name} differ in length; at most {_RAGGED} may")
+    if element.rows > _MAX_RAGGED_ROWS:
+        raise ValueError(f"{element.rows} rows of {element.name} differ in length; at most {_MAX_RAGGED_ROWS} are read")
     columns = {item.name: [] for item in element.properties}
     for _ in range(element.rows):
         for name, values in source.one_row(element).items():
@@ -151,33 +151,33 @@ class _Binary:
     def one_row(self, element: _Element) -> dict:
         row = {}
         for item in element.properties:
-            length = int(self.take(self.order + item.count, 1, element.name)[0]) if item.count else 1
+            length = int(self.take(self.order + item.length_kind, 1, element.name)[0]) if item.length_kind else 1
             if length < 0:
                 raise ValueError(f"a list of {element.name} has length {length}")
             values = self.take(self.order + item.kind, length, element.name)
-            row[item.name] = values if item.count else values[0]
+            row[item.name] = values if item.length_kind else values[0]
         return row
 
     def table(self, element: _Element, lengths: dict[str, int]) -> dict:
         fields = []
         for item in element.properties:
-            if item.count:
-                fields.append((f"{item.name} length", self.order + item.count))
-            fields.append((item.name, self.order + item.kind, (lengths[item.name],) if item.count else ()))
+            if item.length_kind:
+                fields.append((f"{item.name} length", self.order + item.length_kind))
+            fields.append((item.name, self.order + item.kind, (lengths[item.name],) if item.length_kind else ()))
         table = self.take(np.dtype(fields), element.rows, element.name)
-        return {name: table[name] for name in table.dtype.names}
+        return {name: table[name] for name in table.dtype.names or ()}
 
 
 class _Text:
-    """A cursor in the numbers of a text."""
+    """A cursor in the numbers of a text file."""
 
     def __init__(self, data: bytes, start: int):
-        if len(data) - start > _TEXT_LIMIT:
-            raise ValueError(f"{len(data)} bytes of text; at most {_TEXT_LIMIT} are read: save it as binary")
+        if len(data) - start > _MAX_TEXT_BYTES:
+            raise ValueError(f"{len(data)} bytes of text; at most {_MAX_TEXT_BYTES} are read: save it as binary")
         try:
             self.numbers = np.concatenate([np.array(words, np.float64) for words in _words(data, start)])
         except ValueError as error:
-            raise ValueError(f"holds a word that is no number: {str(error)[-60:]}") from None
+            raise ValueError(f"not a number: {str(error)[-60:]}") from None
         self.at = 0
 
     def copy(self) -> "_Text":
@@ -195,19 +195,19 @@ class _Text:
     def one_row(self, element: _Element) -> dict:
         row = {}
         for item in element.properties:
-            length = self.take(1, element.name)[0] if item.count else 1
+            length = self.take(1, element.name)[0] if item.length_kind else 1
             if not (0 <= length <= len(self.numbers) and length == int(length)):
                 raise ValueError(f"a list of {element.name} has length {length:g}")
             values = self.take(int(length), element.name)
-            row[item.name] = values if item.count else values[0]
+            row[item.name] = values if item.length_kind else values[0]
         return row
 
     def table(self, element: _Element, lengths: dict[str, int]) -> dict:
-        widths = [1 + lengths[item.name] if item.count else 1 for item in element.properties]
+        widths = [1 + lengths[item.name] if item.length_kind else 1 for item in element.properties]
         table = self.take(element.rows * sum(widths), element.name).reshape(element.rows, sum(widths))
         columns, at = {}, 0
         for item, width in zip(element.properties, widths, strict=True):
-            if item.count:
+            if item.length_kind:
                 columns[f"{item.name} length"] = table[:, at]
                 columns[item.name] = table[:, at + 1 : at + width]
             else:
@@ -217,27 +217,27 @@ class _Text:
 
 
 def _words(data: bytes, start: int, size: int = 1 << 20) -> Iterator[list[bytes]]:
-    """Words of a text, a megabyte at a time: as Python's they take many times their size."""
+    """Yield the words of a text, a megabyte at a time, because as Python objects they take many times their size."""
     rest = b""
     for at in range(start, len(data), size):
-        *whole, rest = (rest + data[at : at + size] + b"|").split()  # the mark ends the word that may go on
+        *whole, rest = (rest + data[at : at + size] + b"|").split()  # the mark ends a word that may continue
         rest = rest[:-1]
         yield whole
     yield [rest] if rest else []
 
 
 def _fans(polygons) -> np.ndarray:
-    """Triangles (F, 3) int64 of polygons: an array (P, k), or a list of arrays."""
+    """Return triangles (F, 3) int64 of polygons: an array (P, k), or a list of arrays."""
     groups = [polygons] if isinstance(polygons, np.ndarray) else [polygon[None] for polygon in polygons]
     if (count := sum(len(group) * (group.shape[1] - 2) for group in groups)) > MAX_ROWS:
-        raise ValueError(f"its faces make {count} triangles; at most {MAX_ROWS} are read")
+        raise ValueError(f"{count} triangles; at most {MAX_ROWS} are read")
     triangles = [np.zeros((0, 3), np.int64)]
     for group in groups:
         corners = group.shape[1]
         if group.shape[0] and corners < 3:
-            raise ValueError(f"a face has {corners} corners, expected three or more")
+            raise ValueError(f"a face has {corners} corners, expected 3 or more")
         if group.dtype.kind == "f" and not np.equal(np.trunc(group), group).all():
-            raise ValueError("a face names a vertex by a fraction")
+            raise ValueError("a vertex index of a face is not an integer")
         if corners == 3:
             triangles.append(group.astype(np.int64))
             continue

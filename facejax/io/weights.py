@@ -1,9 +1,9 @@
-"""Released weights: one safetensors file per tree of arrays, with a description of where it came from.
+"""Weights files: trees of arrays in safetensors format, with metadata.
 
-A file holds raw arrays and a JSON header, and no code. Leaves are named by their path in the tree, such as
-`weights/blocks/0/kernel`. Loading needs a tree of the expected shapes (`jax.eval_shape` of an `init` gives
-one for free) and checks names, shapes and dtypes against it, so that a file of another model or version
-never loads in part.
+A file contains raw arrays and a JSON header, and no code. Leaves are named by their path in the tree, such as
+`weights/blocks/0/kernel`. Loading needs a tree of the expected shapes, such as `jax.eval_shape` of
+an `init`, and checks names, shapes and dtypes against it, so that a file of another model or version is rejected as a
+whole.
 
 JAX is imported inside functions, so that `load_metadata` answers without it.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as _serialise
 
-from facejax.io import atomic
+from facejax.io import atomic, errors
 
 Tree = Any
 _HEADER = "facejax"
@@ -31,12 +31,16 @@ _DTYPES |= {
 }
 
 
-class WeightsError(atomic.FileError):
-    """A weights file that is missing, damaged, or made for another model."""
+class WeightsError(errors.FileError):
+    """A weights file is missing, damaged, or of another model."""
 
 
 def names(tree: Tree) -> dict[str, Any]:
-    """The leaves of a tree by name (`a/0/b`), in the order of `jax.tree.leaves`."""
+    """Return the leaves of a tree by name (`a/0/b`), in the order of `jax.tree.leaves`.
+
+    Raises:
+      ValueError: two leaves have the same name.
+    """
     import jax
 
     leaves = {}
@@ -49,7 +53,7 @@ def names(tree: Tree) -> dict[str, Any]:
 
 
 def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
-    """Write a tree of arrays and `metadata` (anything JSON holds) to a file that is replaced as a whole."""
+    """Write a tree of arrays and JSON-serialisable `metadata` to a file, atomically."""
     path = Path(path)
     arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
     header = {_HEADER: json.dumps(metadata or {}, sort_keys=True)}
@@ -59,31 +63,35 @@ def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None
 
 
 def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
-    """Read (tree, metadata); `like` has the tree, shapes and dtypes to expect (arrays or `ShapeDtypeStruct`).
+    """Read a tree of NumPy arrays, and the metadata.
 
-    Leaves come back as numpy arrays. Raises `WeightsError` naming the file and every leaf that is missing,
-    unexpected, or of another shape or dtype.
+    Args:
+      path: a safetensors file.
+      like: the expected tree, with arrays or `jax.ShapeDtypeStruct` as leaves.
+
+    Raises:
+      WeightsError: naming the file and every leaf that is missing, unexpected, or of another shape or dtype.
     """
     import jax
 
     with _open(path) as file:
         metadata, expected = _metadata(path, file), names(like)
-        # Before any memory is taken for numbers.
-        stated = {name: _stated(file, name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
+        # From the header, before any array is read.
+        stated = {name: _shape_and_dtype(file, name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
         if wrong := mismatches(expected, stated):
-            raise WeightsError(f"{path} does not fit the model that asks for it: {'; '.join(wrong)}")
+            raise WeightsError(f"{path} does not match the model: {'; '.join(wrong)}")
         found = {name: file.get_tensor(name) for name in expected}
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected]), metadata
 
 
 def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
-    """Read only the description that `save` was given, such as the configuration to build `like` from."""
+    """Read only the metadata, such as the configuration from which to build `like`."""
     with _open(path) as file:
         return _metadata(path, file)
 
 
 def mismatches(expected: dict[str, Any], found: dict[str, Any]) -> list[str]:
-    """One line per leaf name that is missing, unexpected, or differs in shape or dtype; leaves have both."""
+    """Return one line per leaf name that is missing, unexpected, or differs in shape or dtype."""
     wrong = []
     for name in expected.keys() | found.keys():
         if name not in found:
@@ -99,8 +107,8 @@ def _describe(leaf: Any) -> str:
     return f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
 
 
-def _stated(file, name: str) -> Any:
-    """Shape and dtype of a tensor, as the header has them; a dtype that is unknown here is void."""
+def _shape_and_dtype(file, name: str) -> Any:
+    """Return the shape and dtype of a tensor in the header; an unsupported dtype becomes void."""
     import jax
 
     part = file.get_slice(name)
@@ -111,9 +119,11 @@ def _open(path: str | os.PathLike):
     try:
         return safe_open(path, framework="np")
     except FileNotFoundError:
-        raise WeightsError(f"there is no weights file {path}") from None
+        raise WeightsError(f"{path}: no such weights file") from None
     except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path} is not a whole safetensors file ({error}); fetch or write it anew") from error
+        raise WeightsError(
+            f"{path} is not a complete safetensors file ({error}); download or write it again"
+        ) from error
 
 
 def _metadata(path: str | os.PathLike, file) -> dict[str, Any]:

@@ -1,24 +1,24 @@
-"""Which landmark is which: schemes of 68, 66, 51 and 83 points, and what any two of them share.
+"""Landmark schemes of 68, 66, 51 and 83 points, and the points that any two of them share.
 
-Every point of a scheme has an anatomical name, and points of two schemes correspond when their names are equal.
-Left and right are the subject's, whatever the source calls them.
+Every point of a scheme has an anatomical name; points of two schemes correspond when their names are equal. Left and
+right are the subject's, whatever the source calls them.
 
   68   iBUG 300-W, after Multi-PIE.
-  66   the same without the corners of the inner lip, as Saragih et al.'s trackers have it.
+  66   the same without the corners of the inner lip, as in Saragih et al.'s trackers.
   51   68 without the 17 of the jaw.
-  83   BU-3DFE and BU-4DFE (Binghamton), the order of their .bnd files.
+  83   BU-3DFE and BU-4DFE (Binghamton), in the order of their .bnd files.
 
 BU-3DFE's order is not published as a list. Deep-MVLM's notes on the database (docs/BU-3DFE_landmark_info.txt) name 19
 of the 83: eye corners and lids, alae, subnasale, the corners and middles of the lips, the chin. menpo's
-`face_bu3dfe_83` gives the groups and the sides; what the database calls the left eye lies at the left of the
-picture and is the subject's right. The rest, direction included, is read off the points that Deep-MVLM's network for
-this scheme places on a freely licensed head (assets/test2_bu3dfe.txt of cvjena/mvlm), beside 68 points on the same
-head. Inferred only: the contour, of which but the chin's number is documented, and how far apart its points are.
+`face_bu3dfe_83` gives the groups and the sides; what the database calls the left eye lies at the left of the picture
+and is the subject's right. The rest, direction included, is inferred from the points that Deep-MVLM's network for this
+scheme places on a freely licensed head (assets/test2_bu3dfe.txt of cvjena/mvlm), beside 68 points on the same head. The
+contour, except the chin's number, and the spacing of its points are inferred only.
 
-How close points of one name are between 68 and 83: corners of eyes and lips coincide. Lids have two points at
-thirds against three at quarters, brows one line against a closed outline, whose upper edge is taken, and the alae
-are clicked further out in 83: a few millimetres. The 83 know no bridge, tip or base of the nose; the contours of
-both run along the jaw at other intervals and share the chin alone.
+Accuracy of the correspondence between 68 and 83: corners of eyes and lips coincide. Lids have two points at thirds
+against three at quarters; brows are one line against a closed outline, whose upper edge is used; the alae are placed
+further out in 83: a few millimetres. The 83 have no bridge, tip or base of the nose; the contours of both follow the
+jaw at different intervals and share the chin only. L landmarks, C shared ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 GROUPS = ("jaw", "brows", "nose", "eyes", "lips")
-# Brows count from the nose, jaw and contour from the chin, lips from the middle.
+# Brows are numbered from the nose, jaw and contour from the chin, lips from the middle.
 _OUTER_LIP = (
     "right lip corner",
     "right upper lip 2",
@@ -106,7 +106,7 @@ _BU = (
 _WORDS = {"jaw": ("jaw", "chin", "contour"), "brows": ("brow",), "nose": ("nose",), "eyes": ("eye",), "lips": ("lip",)}
 
 
-# What hardly moves in the head's own frame: bridge of the nose, corners of the eyes, the contour beside the ears.
+# Points that hardly move relative to the skull: nose bridge, eye corners, the contour beside the ears.
 _STABLE = (
     *(f"nose bridge {i}" for i in (1, 2, 3)),
     *(f"{side} eye {corner} corner" for side in ("right", "left") for corner in ("inner", "outer")),
@@ -121,34 +121,35 @@ class Scheme(NamedTuple):
     name: str
     points: tuple[str, ...]  # (L,) anatomical names, no two alike
     groups: dict[str, np.ndarray]  # each of `GROUPS` -> (n,) int32; empty where a scheme has none
-    mirror: np.ndarray  # (L,) int32: where the point of the other side stands; one of the middle gives itself
-    stable: np.ndarray  # (n,) int32: points that stay put in the head's own frame
+    mirror: np.ndarray  # (L,) int32: index of the mirrored point; a point of the middle is its own
+    stable: np.ndarray  # (n,) int32: points that hardly move relative to the skull
 
 
 def by_count(count: int) -> Scheme:
-    """The scheme of so many landmarks. Raises `ValueError` that names the known counts for any other."""
+    """Return the scheme of so many landmarks. Raises `ValueError` for an unsupported number."""
     if count not in _SCHEMES:
-        raise ValueError(f"no scheme of {count} landmarks is known; known are {', '.join(map(str, _SCHEMES))}")
+        raise ValueError(f"unsupported number of landmarks: {count} (supported: {', '.join(map(str, _SCHEMES))})")
     return _build(count)
 
 
 def common(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (C,) into the scheme of `source` landmarks and (C,) into that of `target`, of the points they share.
+    """Return indices (C,) into the schemes of `source` and of `target` landmarks, of the points that they share.
 
-    In the source's order. 68 and 51 share 51; 68 and 83 share 47, 51 and 83 share 46; 66 shares 49 with 51, 45 with 83.
+    In the order of the source. 68 and 51 share 51; 68 and 83 share 47; 51 and 83 share 46; 66 shares 49 with 51 and 45
+    with 83.
 
     Raises:
-      ValueError: one of the counts is of no known scheme.
+      ValueError: an unsupported number of landmarks.
     """
     first, second = by_count(source), by_count(target)
-    there = {point: i for i, point in enumerate(second.points)}
-    pairs = [(i, there[point]) for i, point in enumerate(first.points) if point in there]
+    position = {point: i for i, point in enumerate(second.points)}
+    pairs = [(i, position[point]) for i, point in enumerate(first.points) if point in position]
     index = np.array(pairs, np.int32)
     return index[:, 0], index[:, 1]
 
 
 def mirror_name(point: str) -> str:
-    """The name of a point's mirror image."""
+    """Return the name of a point's mirror image."""
     side, _, rest = point.partition(" ")
     return {"left": f"right {rest}", "right": f"left {rest}"}.get(side, point)
 
@@ -163,7 +164,7 @@ def _build(count: int) -> Scheme:
 
 
 def _index(values) -> np.ndarray:
-    # Cached and handed to everybody: nobody may change it.
+    # Cached and shared between callers: read-only.
     index = np.fromiter(values, np.int32)
     index.flags.writeable = False
     return index

@@ -1,1 +1,1 @@
-"""Fixed connectivity: the hierarchy that a decoder climbs, its spirals, and array operations on meshes."""
+"""Triangle meshes: connectivity, normals, closest points, decimation, spirals and spiral convolution."""

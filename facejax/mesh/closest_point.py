@@ -2,11 +2,11 @@
 
 V vertices, F triangles, P points, in one unit. Works on the host, in float64.
 
-The search (`closest_points`) is exact. A triangle lies within a disc: its plane, its centroid, and the distance of the
-farthest corner as radius. The distance to that disc bounds the distance to the triangle from below, and triangles
-beyond the best distance so far are skipped. Triangles are grouped by radius, within a factor of two, each group with a
-k-d tree of centroids: a group is finished when its next centroid is farther than the best distance plus the largest
-radius.
+The search is exact. Every triangle lies in a disc: in its plane, about its centroid, through its farthest corner. The
+distance to the disc is a lower bound of the distance to the triangle. Triangles of the nearest centroids give each
+point a first distance d; then every triangle whose centroid is nearer than d plus its radius is compared, unless its
+disc is farther than the best one found. So that a few large triangles do not widen the search among many small ones,
+triangles are grouped by radius, within a factor of four.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from facejax.mesh import graph
 from facejax.mesh.normals import vertex_normals_host
 
-NEIGHBOURS = 8  # centroids of a group that each point is compared with first; for most points of a scan, all it needs
+NEIGHBOURS = 8  # centroids whose triangles each point is compared with first
 PAIRS = 1 << 20  # of points and triangles, about, that are compared at once
 
 
@@ -65,28 +65,30 @@ def surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
         raise ValueError("the mesh has no area")
     centroids = corners.mean(axis=1)
     radii = np.sqrt(((corners - centroids[:, None]) ** 2).sum(axis=2).max(axis=1))
-    octave = np.frexp(radii)[1] // 2
+    size = np.frexp(radii)[1] // 2  # powers of four
     groups = []
-    for value in np.unique(octave)[::-1]:
-        members = np.flatnonzero(octave == value)
+    for value in np.unique(size)[::-1]:
+        members = np.flatnonzero(size == value)
         groups.append(Group(cKDTree(centroids[members]), members, float(radii[members].max())))
     planes = doubled / np.maximum(area, 1e-30)[:, None]
     normals, edge = vertex_normals_host(vertices, faces), graph.on_boundary(faces, len(vertices))
     return Surface(vertices, faces, normals, edge, centroids, radii, planes, cKDTree(centroids), tuple(groups))
 
 
-def closest_points(on: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, turn: float = 0.0) -> Hits:
+def closest_points(
+    surface: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, normal_weight: float = 0.0
+) -> Hits:
     """Return the closest point of the surface to each of `points` (P, 3).
 
     With their unit `normals` (P, 3), the triangle minimises distance + turn * (1 - cosine of the angle between the
-    normals): one that faces the other way counts as farther by twice `turn`, in the unit of the vertices.
+    normals): one that faces the other way counts as farther by twice `normal_weight`, in the unit of the vertices.
     """
     points = np.asarray(points, np.float64)
-    search = _Search(on, points, None if normals is None else np.asarray(normals, np.float64), turn)
+    search = _Search(surface, points, None if normals is None else np.asarray(normals, np.float64), normal_weight)
     search.visit_neighbours()
-    for group in on.groups:
+    for group in surface.groups:
         search.visit(group)
-    at = np.einsum("pc,pcx->px", search.weights, on.vertices[on.faces[search.face]])
+    at = np.einsum("pc,pcx->px", search.weights, surface.vertices[surface.faces[search.face]])
     return Hits(search.face, search.weights, at, search.distance)
 
 
@@ -165,11 +167,11 @@ def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.take_along_axis(candidates, np.argmin(distance, axis=0)[None, :, None], axis=0)[0]
 
 
-def at(on: Surface, hits: Hits, values: np.ndarray) -> np.ndarray:
+def at(surface: Surface, hits: Hits, values: np.ndarray) -> np.ndarray:
     """Return the values (P, ...) at the closest points, interpolated from those (V, ...) of the surface's vertices."""
-    return np.einsum("pk,pk...->p...", hits.weights, values[on.faces[hits.face]])
+    return np.einsum("pk,pk...->p...", hits.weights, values[surface.faces[hits.face]])
 
 
-def on_edge(on: Surface, hits: Hits) -> np.ndarray:
+def on_boundary(surface: Surface, hits: Hits) -> np.ndarray:
     """Return which closest points lie on the surface's boundary, (P,) bool."""
-    return at(on, hits, on.edge.astype(np.float64)) > 0.99
+    return at(surface, hits, surface.edge.astype(np.float64)) > 0.99

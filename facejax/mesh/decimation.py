@@ -1,7 +1,7 @@
-"""Coarser meshes on a subset of the vertices, and the way back up.
+"""Mesh decimation to a subset of the vertices, and upsampling back to the full mesh.
 
 `decimate` merges vertices by quadric edge collapse (Garland and Heckbert 1997, fast-simplification) and
-keeps of every merged group the member nearest to where the group came to lie. `upsampling` writes every
+keeps of every merged group the member nearest to the position of the merged vertex. `upsampling` expresses every
 fine vertex as a barycentric combination of three coarse ones.
 """
 
@@ -14,14 +14,18 @@ from facejax.mesh import closest_point, graph
 
 
 def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """About N / factor vertices: those kept (M,), faces (G, 3) over them, and each vertex's group (N,).
+    """Decimate a mesh of N vertices to about N / factor.
 
-    Raises `ValueError` when the mesh cannot be made that much coarser.
+    Returns:
+      the kept vertices (M,), faces (G, 3) over them, and the kept vertex (N,) that each vertex merges into; int32.
+
+    Raises:
+      ValueError: the mesh cannot be decimated by that factor.
     """
     if factor <= 1:
         raise ValueError(f"factor: expected more than 1, got {factor}")
-    # The library's error thresholds are absolute: measured in edge lengths, the result does not depend on
-    # the unit.
+    # The library's error thresholds are absolute: vertices are scaled to mean edge length 1, so that the result does
+    # not depend on the unit.
     pairs = graph.edges(faces)
     scaled = vertices / np.mean(np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1))
     _, _, collapses = fast_simplification.simplify(
@@ -30,7 +34,8 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np
     points, coarse, group = fast_simplification.replay_simplification(scaled, faces, collapses)
     if len(coarse) == 0 or len(points) > 0.9 * len(vertices):
         raise ValueError(
-            f"a mesh of {len(vertices)} vertices and {len(faces)} faces cannot be made {factor} times coarser"
+            f"a mesh of {len(vertices)} vertices and {len(faces)} faces cannot be decimated by a factor of {factor}; "
+            "use a smaller factor, or a finer mesh"
         )
     # The member nearest to its group's new position, the first of equals: sort by (group, distance).
     distance = np.linalg.norm(scaled - points[group], axis=1)
@@ -44,10 +49,11 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np
 
 
 def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest point on a coarse mesh.
+    """Return corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest points on a coarse mesh.
 
-    Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some
-    order. Exact: a triangle is passed over only if its bounding sphere lies beyond a point already found.
+    Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some order. The search
+    is exact: a triangle is skipped only if its bounding sphere lies beyond a point already found. Of equally near
+    triangles the first is taken, so that the tables of a hierarchy are reproducible.
     """
     triangles = coarse[faces]
     centre = triangles.mean(axis=1)
@@ -65,6 +71,6 @@ def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> t
         best = order[np.flatnonzero(np.diff(row[order], prepend=-1))]
         corners[start : start + 256] = faces[triangle[best]]
         weights[start : start + 256] = found[best]
-    # Rounding leaves corners of 1e-16; without them a kept vertex maps to itself exactly.
+    # Weights of 1e-16 are rounding errors; without them a kept vertex maps to itself exactly.
     weights[weights < 1e-6] = 0
     return corners, weights / weights.sum(axis=1, keepdims=True)

@@ -1,10 +1,10 @@
 """Deformation transfer: displacements of one face carried to another with the same triangles.
 
 The displacement's gradient on each source triangle is prescribed on the corresponding target triangle, and a Poisson
-solve finds the displacement with the nearest gradients (Sumner and Popovic 2004, linear form: gradients are not rotated,
-and their component normal to the target's triangle is dropped). Gradients leave a translation free, so each vertex is
-also anchored to its displacement on the source, by a weight in units of the mean triangle area: weak where the face
-moves, firm where it never does (`anchor_weights`).
+solve finds the displacement with the nearest gradients (Sumner and Popovic 2004, linear form: gradients are not
+rotated, and their component normal to the target's triangle is dropped). Gradients leave a translation free, so each
+vertex is also anchored to its displacement on the source, by a weight in units of the mean triangle area: weak where
+the face moves, firm where it never does (`anchor_weights`).
 
 Fields are (B, N, 3) on N vertices, in the unit of the vertices; F triangles. Works on the host, in float64.
 """
@@ -28,9 +28,9 @@ def gradient_operator(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.c
     normal = np.cross(b - a, c - a)
     double = np.linalg.norm(normal, axis=1, keepdims=True)
     if not (double > 0).all():
-        raise ValueError(f"triangle {np.argmin(double)} has no area: leave it out, or move one of its corners")
+        raise ValueError(f"triangle {np.argmin(double)} has no area: remove it, or move one of its corners")
     unit = normal / double
-    # The gradient of a corner's hat function is the opposite edge, rotated by 90 degrees in the plane, over twice the area.
+    # The gradient of a corner's hat function is the opposite edge, rotated by 90 degrees, over twice the area.
     corners = [np.cross(unit, edge) / double for edge in (c - b, a - c, b - a)]
     rows = (3 * np.arange(len(faces))[:, None] + np.arange(3)).ravel()
     parts = [

@@ -1,4 +1,4 @@
-"""The mesh as a graph: edges, ordered vertex rings, geodesic distances.
+"""Mesh connectivity as a graph: edges, ordered vertex rings, geodesic distances, boundaries.
 
 N vertices, F triangles. A triangle's corners run counter-clockwise seen from outside.
 """
@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csgraph, csr_array
 
-WELD = 1e-7  # of the mesh's size: vertices nearer to one another are one
+WELD = 1e-7  # of the mesh's size: vertices nearer to one another are merged
 
 
 def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) float64 and (F, 3) int32 copies of a mesh.
+    """Check a mesh and return copies of its vertices (N, 3) float64 and faces (F, 3) int32.
 
-    Raises `ValueError` for wrong shapes, a corner that is no vertex, and a vertex that no triangle uses.
+    Raises `ValueError` for wrong shapes, face indices out of range, and vertices that no triangle uses.
     """
     vertices, faces = np.array(vertices, np.float64), np.array(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
@@ -22,18 +22,21 @@ def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"faces: expected integers (F, 3), got {faces.dtype} {faces.shape}")
     if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces: expected corners in 0..{len(vertices) - 1}, got another index or no face")
+        raise ValueError(f"faces: expected vertex indices in 0..{len(vertices) - 1}, got one out of range or no face")
     unused = np.setdiff1d(np.arange(len(vertices)), faces)
     if len(unused):
-        raise ValueError(f"expected every vertex in a triangle, got {len(unused)} loose, first {unused[0]}")
+        raise ValueError(
+            f"faces: expected every vertex in a triangle, got {len(unused)} unused vertices, first {unused[0]}"
+        )
     return vertices, faces.astype(np.int32)
 
 
 def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make vertices at one place one, as exporters double them along the seams of textures.
+    """Merge vertices at the same position, which exporters duplicate along texture seams.
 
-    Which vertices (W,) stay, the place (N,) of each vertex among them, -1 where no triangle uses it, and the triangles
-    (F', 3) of those that stay, without what has shrunk to a line.
+    Returns:
+      the kept vertices (W,), the index (N,) of each vertex among them, -1 where no triangle uses it, and triangles
+      (F', 3) over the kept ones, without those that have become degenerate.
     """
     size = np.ptp(vertices, axis=0).max()
     used, places = np.unique(faces, return_inverse=True)
@@ -47,16 +50,16 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def edges(faces: np.ndarray) -> np.ndarray:
-    """Undirected edges (E, 2), smaller index first, each once, sorted."""
+    """Return the undirected edges (E, 2), smaller index first, each once, sorted."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(pairs, axis=0)
 
 
 def rings(faces: np.ndarray, count: int) -> list[list[int]]:
-    """The neighbours of each of `count` vertices in counter-clockwise order, read as a cycle.
+    """Return the neighbours of each of `count` vertices in counter-clockwise order, as a cycle.
 
-    A boundary vertex's open fan starts at its clockwise end, so that reading it as a cycle jumps across
-    the boundary and walks on from the other side. Several fans at one vertex follow one another.
+    A boundary vertex's open fan starts at its clockwise end, so that the cycle jumps across the boundary and continues
+    from the other side. Several fans at one vertex follow one another.
     """
     following = [{} for _ in range(count)]
     for a, b, c in faces.tolist():
@@ -69,7 +72,7 @@ def rings(faces: np.ndarray, count: int) -> list[list[int]]:
 
 
 def _chain(following: dict[int, int | None]) -> list[int]:
-    """All keys of {neighbour: next one}, run by run; a closed run starts at its smallest key."""
+    """Return all keys of {neighbour: next one}, run by run; a closed run starts at its smallest key."""
     starts = sorted(following.keys() - set(following.values())) + sorted(following)
     ordered = {}
     for vertex in starts:
@@ -80,13 +83,13 @@ def _chain(following: dict[int, int | None]) -> list[int]:
 
 
 def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shortest paths along edges from the nearest source: distances (N,) and predecessors (N,).
+    """Return the shortest paths along edges from the nearest source: distances (N,) and predecessors (N,).
 
-    Where no path leads, the distance is inf; sources and unreachable vertices have predecessor -1.
+    Unreachable vertices have distance inf; they and the sources have predecessor -1.
     """
     pairs = edges(faces)
     lengths = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
-    # A zero-length edge would be no edge to scipy.
+    # SciPy takes an entry of 0 for no edge.
     lengths = np.maximum(lengths, np.finfo(np.float64).tiny)
     graph = csr_array((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(vertices),) * 2)
     distance, predecessor, _ = csgraph.dijkstra(
@@ -96,12 +99,12 @@ def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple
 
 
 def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
-    """Distance (N,) along edges to the nearest source vertex, in the vertices' unit; inf if unreachable."""
+    """Return the distance (N,) along edges to the nearest source vertex, in the vertices' unit; inf if unreachable."""
     return paths(np.asarray(vertices, np.float64), faces, sources)[0]
 
 
 def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
-    """The boundary's closed loops, each as its vertices in the order in which its triangles run."""
+    """Return the closed loops of the boundary, each as its vertices in the orientation of its triangles."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ahead, back = (
         np.ravel_multi_index(edge.T, (np.max(faces, initial=0) + 1,) * 2) for edge in (directed, directed[:, ::-1])
@@ -111,7 +114,7 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
     while follows:
         loop = [next(iter(follows))]
         after = follows.pop(loop[0])
-        # Where a broken mesh's boundary touches itself, a chain may end without closing.
+        # Where the boundary of a non-manifold mesh touches itself, a chain may end without closing.
         while after != loop[0] and after in follows:
             loop.append(after)
             after = follows.pop(after)
@@ -120,7 +123,7 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
-    """Which of `count` vertices lie on an edge of one triangle alone, (count,) bool."""
+    """Return which of `count` vertices lie on a boundary edge, one of a single triangle: (count,) bool."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1).astype(np.int64)
     found, times = np.unique(pairs[:, 0] * count + pairs[:, 1], return_counts=True)
     mask = np.zeros(count, bool)

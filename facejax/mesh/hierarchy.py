@@ -1,7 +1,7 @@
-"""The hierarchy that a mesh decoder climbs, built once per template.
+"""The multi-resolution hierarchy of a mesh decoder, built once per template.
 
-Coarser meshes, the way back up, and spirals. Levels run from fine (0, the template itself) to coarse.
-Every coarse vertex is one of the template's. All tables are numpy arrays, so that a hierarchy is a plain
+Decimated meshes, upsampling maps and spirals. Levels run from fine (0, the template itself) to coarse.
+Every coarse vertex is one of the template's. All tables are NumPy arrays, so that a hierarchy is a plain
 pytree: pass it to jitted functions as an argument, since tables that are closed over become constants
 that XLA spends seconds folding.
 """
@@ -21,7 +21,7 @@ import numpy as np
 from facejax.mesh import decimation, graph, spirals, stencils
 from facejax.mesh.stencils import Stencil
 
-FORMAT = 1  # raise it when the same template and options give other tables
+FORMAT = 1  # increase it when the same template and options give different tables
 FACTORS = (4.0, 4.0, 4.0, 4.0)
 # Fine to coarse, as in the published sparse-to-dense decoder (Otberdout et al. 2023).
 LENGTHS = (15, 14, 9, 9)
@@ -36,7 +36,7 @@ class Hierarchy(NamedTuple):
     spirals: tuple[np.ndarray, ...]  # n of (N_i, S_i) int32; N_i marks the dummy vertex, which reads zero
     corners: tuple[np.ndarray, ...]  # n of (N_i, 3) int32: the vertices of level i + 1 under each vertex
     weights: tuple[np.ndarray, ...]  # n of (N_i, 3) float32: their barycentric weights, >= 0, sum 1
-    # What the tables above amount to, for `ops.spiral_conv`:
+    # Derived from the tables above, for `spiral_conv`:
     climbs: tuple[Stencil, ...]  # n: the spirals of level i on a signal of level i + 1
     surface: Stencil  # the spirals of level 0 on a signal of level 0
 
@@ -56,15 +56,21 @@ def build(
     dilation: int = 1,
     cache: str | os.PathLike | None = None,
 ) -> Hierarchy:
-    """The hierarchy of a template (N, 3) with triangles (F, 3).
+    """Build the hierarchy of a template.
 
-    `factors` divide the number of vertices from level to level. `lengths` are the spiral lengths, one for
-    all levels or one per level but the coarsest; None takes int(mean + 2 std) of the two-ring sizes.
-    `reference` is the vertex that spirals start towards, by default the one with the largest z: the tip
-    of the nose, in this project's frame. With a folder `cache` the result is kept under the hash of
-    everything that it depends on.
+    Args:
+      vertices: (N, 3).
+      faces: (F, 3).
+      factors: by which the number of vertices is divided from level to level.
+      lengths: of the spirals, one for all levels or one per level but the coarsest; None takes int(mean + 2 std) of the
+        two-ring sizes.
+      reference: the vertex towards which spirals start, by default the one with the largest z: the tip of the nose in
+        the canonical frame.
+      dilation: of the spirals.
+      cache: a folder; the result is stored there under a hash of all inputs.
 
-    Raises `ValueError` for a broken mesh, options out of range, or a mesh too small for the factors.
+    Raises:
+      ValueError: an invalid mesh, an option out of range, or a mesh too small for the factors.
     """
     vertices, faces = graph.check(vertices, faces)
     if not isinstance(lengths, Sequence):
@@ -89,19 +95,19 @@ def build(
 
 
 def save(hierarchy: Hierarchy) -> dict[str, np.ndarray]:
-    """The tables by name (`spirals/0`), for any file of named arrays; `load` derives the stencils."""
+    """Return the tables by name (`spirals/0`), for any file of named arrays; `load` derives the stencils."""
     return {f"{field}/{i}": table for field in _STORED for i, table in enumerate(getattr(hierarchy, field))}
 
 
 def load(arrays: Mapping[str, np.ndarray]) -> Hierarchy:
-    """The hierarchy that `save` described. Raises `ValueError` for missing tables or ones that do not fit."""
+    """Return the hierarchy of the tables that `save` gave. Raises `ValueError` for missing or inconsistent tables."""
     levels = sum(name.startswith("kept/") for name in arrays)
     counts = (levels, levels, *[levels - 1] * 3)
     names = [[f"{field}/{i}" for i in range(n)] for field, n in zip(_STORED, counts, strict=True)]
     expected = {name for group in names for name in group}
     if levels < 2 or expected != set(arrays):
         wrong = sorted(expected ^ set(arrays)) or ["kept/0"]
-        raise ValueError(f"not the tables of a hierarchy: missing or unexpected {', '.join(wrong)}")
+        raise ValueError(f"hierarchy: missing or unexpected tables {', '.join(wrong)}")
     kept, faces, tables, corners, weights = (tuple(np.asarray(arrays[name]) for name in group) for group in names)
     sizes = [len(level) for level in kept]
     for i in range(levels - 1):
@@ -110,7 +116,7 @@ def load(arrays: Mapping[str, np.ndarray]) -> Hierarchy:
             raise ValueError(f"level {i}: expected tables for {sizes[i]} vertices, got shapes {shapes}")
         low, high = min(tables[i].min(), corners[i].min()), (tables[i].max(), corners[i].max())
         if low < 0 or high[0] > sizes[i] or high[1] >= sizes[i + 1]:
-            raise ValueError(f"level {i}: a table points to a vertex that does not exist")
+            raise ValueError(f"level {i}: a table has a vertex index out of range")
     return _complete(kept, faces, tables, corners, weights)
 
 
@@ -143,9 +149,9 @@ def _complete(kept, faces, tables, corners, weights) -> Hierarchy:
 
 
 def _read(path: Path) -> Hierarchy | None:
-    """A cached hierarchy; None where there is none or the file is damaged, so that it is built anew."""
+    """Return a cached hierarchy; None where there is none or the file is damaged, so that it is rebuilt."""
     try:
-        # Opened here, because np.load leaves a file that it cannot read open.
+        # Opened here, because np.load does not close a file that it cannot read.
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
             return load(dict(arrays))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
@@ -154,7 +160,7 @@ def _read(path: Path) -> Hierarchy | None:
 
 def _write(path: Path, hierarchy: Hierarchy) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Beside the target, because a rename is atomic only within one file system.
+    # In the same folder, because a rename is atomic only within one file system.
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
     try:
         with os.fdopen(handle, "wb") as file:

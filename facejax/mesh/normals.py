@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from facejax.geometry.sphere import root
+from facejax.geometry.sphere import safe_sqrt
 
 SHORTEST = 1e-20  # a sum of normals times double areas that is no longer has no direction, in the unit squared
 
@@ -76,7 +76,7 @@ def unit_or_zero(vectors: jax.Array, size: jax.Array, least: jax.Array) -> jax.A
 
 def norm(vectors: jax.Array) -> jax.Array:
     """Return the norm (..., 1) of vectors (..., 3), with gradient 0 at 0."""
-    return root(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
+    return safe_sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

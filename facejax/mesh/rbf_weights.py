@@ -1,13 +1,13 @@
-"""How landmarks sit on a mesh: whether they lie on it, how far they reach, and which lip is whose.
+"""RBF weights of landmarks on a face mesh: validity checks, falloff with distance, separation of the lips.
 
 L landmarks, anywhere on a mesh of N vertices and F triangles, in one unit. The spacing of landmarks is their mean
 distance to their nearest other; their spread is their root mean square distance to their centroid.
 
-`weights` makes a warp by `geometry.rbf` fit for faces. Bare radial functions fail them in two places: they carry the
-jaw's motion on to neck and skull, which `falloff` ends; and they know distances through space alone, in which closed
-lips are one, so that a mouth stays filled with skin when it opens, which `upper_lip_share` prevents. On makehuman4d's validation
-subjects the two together bring the mean error of the head from 0.76 to 0.25 mm, of the face from 0.39 to 0.29 mm and of
-the rim of the mouth from 1.20 to 0.59 mm (`experiments.rbf_warp`).
+`weights` adapts a warp by `geometry.rbf` to faces. Plain radial functions fail in two places: they extend the jaw's
+motion to neck and skull, which `falloff` prevents; and they use distances in space, in which closed lips coincide, so
+that skin closes an opening mouth, which `upper_lip_share` prevents. On makehuman4d's validation subjects the two
+together reduce the mean error of the head from 0.76 to 0.25 mm, of the face from 0.39 to 0.29 mm and of the rim of the
+mouth from 1.20 to 0.59 mm (`experiments.rbf_warp`).
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ REACH = 3.0  # in landmark spacings
 
 
 def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
-    """Raise `ValueError` where one of the landmarks (L, 3) does not lie on the mesh of vertices (N, 3), or on another.
+    """Raise `ValueError` where landmarks (L, 3) coincide, or do not lie on the mesh of vertices (N, 3).
 
-    It may be as far from the nearest vertex as a tenth of the landmarks' spread or, on a coarse mesh, as that vertex is
-    from its sixth neighbour.
+    The distance to the nearest vertex may be a tenth of the landmarks' spread or, on a coarse mesh, the distance of
+    that vertex to its sixth neighbour.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
     tree = cKDTree(vertices)
@@ -41,23 +41,23 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
     pairs = cKDTree(landmarks).query_pairs(rbf.COINCIDENT * spread)
     if pairs:
         a, b = min(pairs)
-        raise ValueError(f"landmarks {a} and {b} are in one place, {landmarks[a]}: move one of them")
+        raise ValueError(f"landmarks {a} and {b} coincide at {landmarks[a]}: move one of them")
     limit = np.maximum(OFF_MESH * spread, ring)
     worst = int(np.argmax(distance - limit))
     if distance[worst] > limit[worst]:
         raise ValueError(
             f"landmark {worst} is {distance[worst]:.4g} off the mesh (nearest vertex {nearest[worst]}, allowed "
-            f"{limit[worst]:.4g}): are landmarks and mesh of one face, in one unit and one coordinate system?"
+            f"{limit[worst]:.4g}): check that landmarks and mesh have the same face, unit and coordinate system"
         )
 
 
 def distant_boundary(
     vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH
 ) -> np.ndarray:
-    """The vertices (P,) of the boundary that are farther than `reach` spacings from every landmark (L, 3).
+    """Return the boundary vertices (P,) that are farther than `reach` spacings from every landmark (L, 3).
 
-    On a head the edge of the neck; of a mask cut out of a face the parts of its edge that no landmark moves. The edges
-    of mouth and eyes, along which landmarks lie, are not among them. None on a closed mesh.
+    On a head, the edge of the neck; on a cropped face, the parts of its edge without landmarks. The edges of mouth and
+    eyes, along which landmarks lie, are not among them. Empty on a closed mesh.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
     if len(landmarks) < 2:
@@ -69,12 +69,12 @@ def distant_boundary(
 
 
 def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH) -> np.ndarray:
-    """Factors (N,) float32 in [0, 1], by which the rows of `geometry.rbf.weights` let go of what landmarks do not move.
+    """Return factors (N,) float32 in [0, 1] for the rows of `geometry.rbf.weights`, falling with distance to landmarks.
 
-    1 at a landmark; 0 on the `distant_boundary` and wherever else it is as far to the nearest landmark (L, 3) as from the rim's
-    nearest vertex; the smooth step of that distance between. Against Seo & Luo's (2021, section 5) unstable boundary,
-    and for a skull that stays where it is. It would hold back the motion of the whole head: take that out first
-    (`geometry.align.procrustes`). 1 everywhere on a closed mesh, whose end nothing marks.
+    1 at a landmark (L, 3); 0 where the nearest landmark is as far as from the nearest vertex of the
+    `distant_boundary`, or farther; a smoothstep between. This fixes skull and neck, and the unstable boundary of Seo &
+    Luo (2021, section 5). It would damp the motion of the whole head: remove that first (`geometry.align.procrustes`).
+    1 everywhere on a closed mesh, which has no boundary.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
     pinned = distant_boundary(vertices, faces, landmarks, reach=reach)
@@ -87,13 +87,13 @@ def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, r
 def upper_lip_share(
     vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]]
 ) -> np.ndarray:
-    """The share (N,) in [0, 1] that the upper of two lips has of each vertex: 1 above, 0 below, between at the corners.
+    """Return the upper lip's share (N,) in [0, 1] of each vertex: 1 above, 0 below, in between at the corners.
 
-    lips: the landmarks (of L, 3) of either. With a and b the ways along the mesh to the nearest of the upper and of the
-    lower: the smooth step of b / (a + b) from 1/4 to 3/4. Where no way leads, 1/2.
+    lips: the landmarks (of L, 3) of the upper and of the lower lip. With a and b the geodesic distances to the nearest
+    of the upper and of the lower: the smoothstep of b / (a + b) from 1/4 to 3/4. 1/2 where one is unreachable.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
-    # From the corners of the triangle that the landmark lies in: the vertex nearest in space may be the other lip's.
+    # From the corners of the triangle that contains the landmark: the nearest vertex may be the other lip's.
     corners, _ = decimation.upsampling(landmarks, vertices, faces)
     upper, lower = (graph.geodesic(vertices, faces, np.unique(corners[list(lip)])) for lip in lips)
     reached = np.isfinite(upper) & np.isfinite(lower)
@@ -105,10 +105,10 @@ def upper_lip_share(
 def split_lips(
     vertices: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]], share: np.ndarray, **options
 ) -> np.ndarray:
-    """Weights (N, L) float32 of two fits: one without the lower lip's landmarks, one without the upper's.
+    """Return weights (N, L) float32 blended from two fits, one without the lower and one without the upper lip.
 
-    `share` (N,), from `upper_lip_share`, is the first one's part of each vertex. Landmarks are met and affine motions carried on
-    as by each of the two; options as of `geometry.rbf.fit`.
+    `share` (N,), from `upper_lip_share`, is the weight of the first fit at each vertex. Landmarks are interpolated and
+    affine motions reproduced as by each of the two; options as of `geometry.rbf.fit`.
     """
     found = np.zeros((len(vertices), len(landmarks)), np.float32)
     for left_out, part in ((lips[1], share), (lips[0], 1 - share)):
@@ -126,12 +126,10 @@ def weights(
     reach: float = REACH,
     **options,
 ) -> np.ndarray:
-    """Weights (N, L) float32 for `geometry.rbf.warp`, of a face at rest: ended at its rim, its lips parted.
+    """Return weights (N, L) float32 for `geometry.rbf.warp` of a face at rest, with falloff and separate lips.
 
     lips: the landmarks of the upper and of the lower lip, `IBUG_LIPS` with 68; without them one fit serves the whole
-    face. options as of `geometry.rbf.fit`.
-
-    Raises `ValueError` for what `check` and `geometry.rbf.fit` refuse.
+    face. options as of `geometry.rbf.fit`. Raises `ValueError` as `check` and `geometry.rbf.fit` do.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
     check(landmarks, vertices)
@@ -145,7 +143,7 @@ def weights(
 def face_region(
     vertices: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, within: float = 25.0
 ) -> np.ndarray:
-    """The face of a head: a mask (N,) of the vertices `within` so many mm of a landmark's vertex, along the surface."""
+    """Return the face region of a head: a mask (N,) of vertices with geodesic distance to a landmark <= `within` mm."""
     return graph.geodesic(vertices, faces, landmark_index) <= within
 
 

@@ -1,17 +1,17 @@
-"""Array operations on meshes of fixed connectivity: spiral convolution (with upsampling), and normals.
+"""Spiral convolution on meshes of fixed connectivity, with upsampling.
 
 V vertices out, M vertices in, B samples, C channels in, O channels out, S spiral positions, K vertices
 read per position. Signals are (V, B, C), the batch inside, so that one gathered row is B * C contiguous
 numbers.
 
-How the convolution came to be as it is (batch 16, 3,260 vertices, one core of a Xeon; ms of the decoder,
+Measurements behind the implementation (batch 16, 3,260 vertices, one core of a Xeon; ms of the decoder,
 forward / gradient): gathering (V, S * C) blocks and multiplying them 340 / 342; multiplying first, per
 position, and gathering sums 14 / 60. Upsampling and multiplication commute, so the product is taken on
 the coarse side: a quarter of the arithmetic. The transposed gather of the finest upsampling takes 19 ms
 as a scatter, 5 ms by inverse lists. Written out position by position, XLA fuses the producer of the
 gradient into each of some 300 gathers (387 ms, 36 s to compile); a scan keeps it in memory and compiles
-in a second or two. All of that is a CPU's and of whole batches. On a GPU the scan's many small kernels are
-what takes time (an H200: 0.76 / 2.1 ms), and all positions at once are faster (0.43 / 0.82 ms).
+in a second or two. This holds for a CPU and whole batches. On a GPU the scan's many small kernels
+dominate (H200: 0.76 / 2.1 ms), and all positions at once are faster (0.43 / 0.82 ms).
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ from jax.interpreters import ad, batching, mlir
 
 from facejax.mesh.stencils import Stencil
 
-# With few output channels the products over all positions come out of one matrix product, and the batch
-# is the innermost axis: 1.3 ms for 16 -> 3 channels instead of 3.7. From 8 channels on, rows of B * O
+# With few output channels the products of all positions are one matrix product, with the batch as the
+# innermost axis: 1.3 ms for 16 -> 3 channels instead of 3.7. From 8 channels on, rows of B * O
 # numbers are faster.
 _FEW_CHANNELS = 8
-# On a CPU, all positions at once while their products (S * M * B * O numbers) stay in the cache: single frames. One
-# frame of 5,041 vertices: 1.0 ms instead of 1.5.
+# On a CPU, all positions at once while their products (S * M * B * O numbers) fit in the cache, as for single frames
+# (5,041 vertices: 1.0 ms instead of 1.5).
 _AT_ONCE = 400_000
-# Off the CPU, lists are written out up to here; beyond, one gather and a sum, which a GPU's compiler fuses. A CPU's
-# does not, and writes all that was gathered to memory: the decoder's gradient took 77 ms so instead of 25.
+# On other platforms up to this many gathers are unrolled; beyond, one gather and a sum, which a GPU's compiler fuses.
+# A CPU's does not, and writes all gathered rows to memory: the decoder's gradient took 77 ms instead of 25.
 _FEW_LISTS = 8
 
 
 @jax.jit
 def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
-    """Spiral convolution of x (M, B, C) with kernel (S, C, O): (V, B, O), where the stencil leads.
+    """Return the spiral convolution (V, B, O) of x (M, B, C) with kernel (S, C, O).
 
-    out[v] = sum_s (lifted x)[spiral[v, s]] @ kernel[s], where the stencil joins the lifting from a coarse
-    mesh (barycentric, linear) and the spirals (Bouritsas et al. 2019, eq 3; Lim et al. 2018). No bias.
+    out[v] = sum_s (upsampled x)[spiral[v, s]] @ kernel[s], where the stencil combines upsampling from a coarse mesh
+    (barycentric, linear) and spirals (Bouritsas et al. 2019, eq 3; Lim et al. 2018). No bias. Raises `ValueError` on
+    shapes that do not fit.
     """
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
@@ -48,7 +49,9 @@ def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
         raise ValueError(f"x: expected (M, B, {channels}) to fit the kernel {kernel.shape}, got {x.shape}")
     if stencil.source.shape[0] != positions or stencil.back.shape[2] != count:
         expected = (stencil.source.shape[0], stencil.back.shape[2])
-        raise ValueError(f"the stencil has {expected} positions and vertices, got {(positions, count)}")
+        raise ValueError(
+            f"stencil: has {expected} (positions, vertices), expected {(positions, count)} of kernel and x"
+        )
     if jax.default_backend() != "cpu" or positions * count * batch * out_channels <= _AT_ONCE:
         return spiral_conv_at_once(x, kernel, stencil)
     return spiral_conv_by_position(x, kernel, stencil)
@@ -56,9 +59,9 @@ def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
 
 @jax.jit
 def spiral_conv_by_position(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
-    """`spiral_conv`, the same, one position after another: what is gathered from stays in a CPU's cache.
+    """Compute `spiral_conv` one position after another, so that the gathered array stays in a CPU's cache.
 
-    Memory for M * B * O numbers. `spiral_conv` takes this form on a CPU, but for few numbers.
+    Memory for M * B * O numbers. `spiral_conv` takes this form on a CPU, except for small inputs.
     """
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
@@ -77,9 +80,9 @@ def spiral_conv_by_position(x: jax.Array, kernel: jax.Array, stencil: Stencil) -
 
 @jax.jit
 def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
-    """`spiral_conv`, the same, as one product and one gathered sum over all positions: few large kernels, for a GPU.
+    """Compute `spiral_conv` as one product and one gathered sum over all positions: few large kernels for a GPU.
 
-    Memory for S * M * B * O numbers. `spiral_conv` takes this form on any processor but a CPU, and there for few.
+    Memory for S * M * B * O numbers. `spiral_conv` takes this form on accelerators, and on a CPU for small inputs.
     """
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
@@ -91,7 +94,7 @@ def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> ja
 
 
 def _joined(stencil: Stencil) -> Stencil:
-    """The maps of all positions as a single one, from M * S rows, those of a vertex together; without the axis S."""
+    """Return the maps of all positions as one map, without the axis S, from M * S rows ordered by vertex."""
     positions, vertices = len(stencil.source), stencil.source.shape[2]
     position = jnp.arange(positions)[:, None]
     return Stencil(
@@ -105,7 +108,7 @@ def _joined(stencil: Stencil) -> Stencil:
 
 
 def _sum_positions(make, inputs: jax.Array, stencil: Stencil, *, axis: int) -> jax.Array:
-    """Sum over positions s of stencil_s @ make(inputs[s]), with the vertices along `axis`."""
+    """Return the sum over positions s of stencil_s @ make(inputs[s]), with the vertices along `axis`."""
     one = jax.eval_shape(make, inputs[0])
     shape = one.shape[:axis] + stencil.source.shape[2:] + one.shape[axis + 1 :]
 
@@ -116,9 +119,8 @@ def _sum_positions(make, inputs: jax.Array, stencil: Stencil, *, axis: int) -> j
     return jax.lax.scan(add, jnp.zeros(shape, one.dtype), (inputs, stencil))[0]
 
 
-# One position's sparse map as a primitive: linear in its first operand, its transpose is the same
-# primitive read the other way. Thus forward mode, reverse mode and vmap all exist; a custom_vjp would
-# give up the first.
+# One position's sparse map as a primitive: linear in its first operand, its transpose is the same primitive with
+# `transposed`. So forward mode, reverse mode and vmap all exist; a custom_vjp would lose forward mode.
 _stencil_p = Primitive("stencil")
 
 
@@ -133,7 +135,7 @@ def _apply(x: jax.Array, *tables: jax.Array, axis: int, transposed: bool) -> jax
 
 
 def _gather(x: jax.Array, index: jax.Array, weight: jax.Array, axis: int) -> jax.Array:
-    """Sum over k of weight[k] x[index[k]]."""
+    """Return the sum over k of weight[k] x[index[k]]."""
     if len(index) <= _FEW_LISTS or jax.default_backend() == "cpu":
         return sum(_weigh(w, _take(x, i, axis), axis) for i, w in zip(index, weight, strict=True))
     return jnp.sum(_weigh(weight, _take(x, index, axis), axis), axis=axis)

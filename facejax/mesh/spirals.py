@@ -1,9 +1,8 @@
-"""Spirals: a fixed order on every vertex's surroundings, so that one weight matrix fits all of them.
+"""Spirals: a fixed order on the neighbourhood of every vertex, so that all vertices share one weight matrix.
 
 A spiral is its centre, then ring after ring counter-clockwise (Lim et al. 2018; Bouritsas et al. 2019,
-Neural3DMM). The first neighbour is the one that a shortest path to a reference vertex would take, which
-makes the directions of neighbouring spirals agree. Tables are (N, S) int32; entry N is a dummy vertex
-that reads zero.
+Neural3DMM). The first neighbour is the next vertex on a shortest path to a reference vertex, which aligns
+the directions of neighbouring spirals. Tables are (N, S) int32; entry N is a dummy vertex that reads zero.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ def build(
     rings: int = 2,
     dilation: int = 1,
 ) -> np.ndarray:
-    """Spirals (N, S) of a mesh.
+    """Return the spirals (N, S) int32 of a mesh of vertices (N, 3) and faces (F, 3).
 
-    S is `length`, or int(mean + 2 std) of the number of vertices within `rings` rings; longer spirals are
-    cut, shorter ones padded with N. With a dilation of d, the centre and every d-th vertex after it are
-    kept.
+    S is `length`, or int(mean + 2 std) of the number of vertices within `rings` rings; longer spirals are truncated,
+    shorter ones padded with N. With a dilation of d, the centre and every d-th vertex after it are kept. Raises
+    `ValueError` for an option out of range.
     """
     if (length is not None and length < 1) or dilation < 1 or rings < 1:
         raise ValueError(f"expected length, dilation and rings of 1 or more, got {length}, {dilation}, {rings}")
@@ -42,9 +41,9 @@ def build(
 
 
 def first_neighbours(vertices: np.ndarray, faces: np.ndarray, around: list[list[int]], reference: int) -> np.ndarray:
-    """Each vertex's first neighbour (N,): the predecessor on the shortest path from the reference.
+    """Return each vertex's first neighbour (N,): the predecessor on the shortest path from the reference.
 
-    A component that no path reaches takes its own vertex nearest to the reference as its reference. A
+    A component that is not connected to the reference takes its vertex nearest to the reference instead. A
     reference has no predecessor and takes its nearest neighbour.
     """
     if not 0 <= reference < len(vertices):
@@ -65,12 +64,12 @@ def first_neighbours(vertices: np.ndarray, faces: np.ndarray, around: list[list[
 def _walk(
     centre: int, first: int, around: list[list[int]], *, count: int | None = None, rings: int | None = None
 ) -> list[int]:
-    """Vertices of the spiral at `centre`, up to `count` vertices or all of the first `rings` rings.
+    """Return the vertices of the spiral at `centre`, up to `count` vertices or all of the first `rings` rings.
 
-    Each vertex of a ring hands over its unseen neighbours, counter-clockwise from the one that it was
-    reached from: so the outer ring runs counter-clockwise too.
+    Each vertex of a ring contributes its unseen neighbours, counter-clockwise from the one that it was reached from:
+    so the outer ring runs counter-clockwise too.
     """
-    seen = {centre: first}  # vertex: the neighbour where its own fan is entered
+    seen = {centre: first}  # vertex: the neighbour at which its own fan starts
     ring = [centre]
     while ring and (count is None or len(seen) < count) and (rings is None or rings > 0):
         outer = []

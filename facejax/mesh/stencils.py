@@ -1,10 +1,10 @@
-"""Spirals as sparse maps: what every position of every spiral reads, and who reads every vertex.
+"""Spirals as sparse maps: the vertices that each spiral position reads, and the transposed tables.
 
 A spiral convolution on an upsampled signal is, per spiral position s, a sparse V x M matrix: row v holds
 the barycentric weights of the coarse vertices under the s-th vertex of v's spiral. Its product with dense
 rows is a sum of K gathers. The gradient needs the transpose, which would be a scatter. XLA's scatter on a
-CPU takes ten times longer per row than its gather, so a second table lists for every coarse vertex where
-it is read: as many slots as nine vertices in ten need, and a short remainder that is scattered.
+CPU takes ten times longer per row than its gather, so a second table lists for every coarse vertex the rows that
+read it: as many slots as 90 % of the vertices need, and a short remainder that is scattered.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ class Stencil(NamedTuple):
 
 
 def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
-    """The maps of spirals (V, S) on a signal of W vertices, lifted by corners and weights (W, K) from `coarse` ones.
+    """Return the maps of spirals (V, S) on a signal of W vertices, upsampled from `coarse` ones.
 
-    Usually V = W: the spirals of all. W marks the dummy vertex, which reads zero.
+    Corners and weights (W, K) are the upsampling. Usually V = W: the spirals of all vertices. W marks the dummy vertex,
+    which reads zero.
     """
     length = spirals.shape[1]
-    real = spirals < len(corners)  # of all vertices, though the spirals may be those of some alone
+    real = spirals < len(corners)  # corners has all vertices, spirals may be those of a subset
     spirals = np.where(real, spirals, 0)
     source = np.transpose(corners[spirals], (1, 2, 0))
     weight = np.transpose(weights[spirals] * real[..., None], (1, 2, 0)).astype(np.float32)
@@ -46,7 +47,7 @@ def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse:
 
     position, _, reader = np.nonzero(weight)
     target, value = source[weight > 0], weight[weight > 0]
-    # Entries of one (position, target) side by side, each with its place in that list.
+    # Entries of one (position, target) are adjacent, each with its index in that list.
     bucket = position * coarse + target
     order = np.argsort(bucket, kind="stable")
     bucket, reader, value = bucket[order], reader[order], value[order]
@@ -71,6 +72,6 @@ def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse:
 
 
 def flat(spirals: np.ndarray) -> Stencil:
-    """The maps of spirals (V, S) on a signal of the same V vertices."""
+    """Return the maps of spirals (V, S) on a signal of the same V vertices, without upsampling."""
     own = np.arange(len(spirals))[:, None]
     return build(spirals, own, np.ones_like(own, np.float32), len(spirals))

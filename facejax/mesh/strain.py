@@ -1,9 +1,10 @@
-"""What a displacement does to the skin locally: stretch at every vertex, and the frame to read it in.
+"""Green strain of a displacement at every vertex, and the vertex normals.
 
 The Green strain of a displacement u on each triangle, E = 1/2 (G + G^T + G^T G) with G the gradient of u in the
-triangle's plane, symmetric and blind to rotation; averaged over the triangles about a vertex. N vertices, F
-triangles, B samples, W triangles at most about a vertex. Signals are (N, B, C), the batch inside, as
-`facejax.mesh.ops` wants them."""
+triangle's plane, symmetric and invariant to rotation; averaged over the triangles about a vertex. N vertices, F
+triangles, B samples, at most W triangles about a vertex. Signals are (N, B, C), the batch inside, as in
+`facejax.mesh.spiral_conv`.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +18,15 @@ from facejax.mesh import normals
 
 
 class VertexTriangles(NamedTuple):
-    """The triangles, and which of them meet at each vertex."""
+    """The triangles, and those adjacent to each vertex."""
 
     faces: np.ndarray  # (F, 3) int32
-    about: np.ndarray  # (N, W) int32; F marks an empty place
+    about: np.ndarray  # (N, W) int32; F marks an empty slot
     count: np.ndarray  # (N,) float32
 
 
 def vertex_triangles(faces: np.ndarray, count: int) -> VertexTriangles:
-    """The tables of triangles (F, 3) on `count` vertices."""
+    """Return the tables of triangles (F, 3) on `count` vertices."""
     owner = np.argsort(faces.ravel(), kind="stable")
     vertex = faces.ravel()[owner]
     sizes = np.bincount(vertex, minlength=count)
@@ -37,10 +38,10 @@ def vertex_triangles(faces: np.ndarray, count: int) -> VertexTriangles:
 
 @jax.jit
 def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles) -> tuple[jax.Array, jax.Array]:
-    """Strain (N, B, 6) and the neutral face's unit normals (N, B, 3), of (N, B, 3) and (N, B, 3).
+    """Return the strain (N, B, 6) of displacements (N, B, 3) of a neutral face (N, B, 3), and its normals (N, B, 3).
 
-    Strain has no unit: 0.1 is a tenth longer; xx, yy, zz, xy, xz, yz in the axes of the mesh. Both are 0 where the
-    triangles about a vertex have no area.
+    Strain has no unit: 0.1 is an elongation by a tenth; xx, yy, zz, xy, xz, yz in the axes of the mesh. Normals have
+    unit length. Both are 0 where the triangles about a vertex have no area. Raises `ValueError` for other shapes.
     """
     if displacements.shape != neutral.shape or neutral.shape[-1] != 3:
         raise ValueError(f"expected two arrays (N, B, 3), got {displacements.shape} and {neutral.shape}")
@@ -61,6 +62,6 @@ def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles
     on_faces = jnp.concatenate([jnp.stack(six, axis=-1), normal], axis=-1)
     padded = jnp.concatenate([on_faces, jnp.zeros_like(on_faces[:1])])
     mean = padded[tables.about].sum(axis=1) / tables.count[:, None, None]
-    # What is left of a fold's normals that cancel is no direction.
+    # The rounding error of normals that cancel has no meaningful direction.
     lean = mean[..., 6:]
     return mean[..., :6], normals.unit_or_zero(lean, normals.norm(lean), jnp.finfo(lean.dtype).eps)

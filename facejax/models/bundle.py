@@ -1,4 +1,4 @@
-"""What a model file holds: labels, the topology, a generator of motion and a decoder of meshes, in one record.
+"""Model files: labels, the mesh topology, a generator of motion and a mesh decoder in one record.
 
     models = bundle.load()
     bundle.save("own.safetensors", models)
@@ -23,34 +23,38 @@ from facejax.models.decoders import gpmm_residual, s2d_dec
 from facejax.models.motion import generators, start_poses, tangent_pca
 
 RELEASED = "makehuman4d.safetensors"
-S2D, REFINED = "s2d", "refined"  # kinds of decoder
-COMPONENTS = 200  # of the GPMM, in a file: as many more gain 0.001 mm, and weigh 4 MB
+S2D, REFINED = "s2d", "refined"  # values of "decoder" in a file's metadata: S2D-Dec, or GPMM and residual decoder
+COMPONENTS = 200  # of the GPMM in a file; twice as many gain 0.001 mm and add 4 MB
 
 
 class Face(NamedTuple):
-    """The topology that the models were trained on."""
+    """The mesh topology that the models were trained on."""
 
-    vertices: np.ndarray  # (N, 3) a neutral face to start from: the average of the population
+    vertices: np.ndarray  # (N, 3) the mean neutral face of the population, mm
     faces: np.ndarray  # (F, 3) triangles
     landmark_index: np.ndarray  # (L,) vertices
-    source_index: np.ndarray  # (N,) vertices of MakeHuman's body, or empty: another topology
+    source_index: np.ndarray  # (N,) vertices of MakeHuman's body; empty for another topology
     mask: np.ndarray  # (N,) bool, the face region
 
 
 class Models(NamedTuple):
-    """Everything that inference needs."""
+    """All models that inference needs."""
 
     labels: tuple[str, ...]  # neutral first
     face: Face
     motion: generators.Generator
-    starts: start_poses.StartPoses  # peaks from which a motion starts that does not start at neutral
+    starts: start_poses.StartPoses  # distribution of the poses from which a motion starts
     hierarchy: mesh_hierarchy.Hierarchy
-    decoder: s2d_dec.S2DDec | gpmm_residual.GPMMResidual  # S2D-Dec, or the best linear answer refined
-    about: dict[str, Any]  # how the weights were made
+    decoder: s2d_dec.S2DDec | gpmm_residual.GPMMResidual  # S2D-Dec, or GPMM estimate plus residual decoder
+    about: dict[str, Any]  # provenance of the weights
 
 
 def load(path: str | os.PathLike | None = None) -> Models:
-    """The released models, or those of a file. Raises `weights.WeightsError`."""
+    """Read the released models, or those of a file.
+
+    Raises:
+      WeightsError: a file that is missing, damaged or not a facejax model.
+    """
     path = path or resources.files("facejax.assets").joinpath(RELEASED)
     about = weights.load_metadata(path)
     try:
@@ -65,7 +69,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
             tree["decoder"] = gpmm_residual.unpack(tree["decoder"], tree["hierarchy"], tree["face"].faces)
     except (ValueError, KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path}: {error}") from error
-    # The face stays on the host: it is read by exporters, not by networks.
+    # The face stays on the host: exporters read it, networks do not.
     networks = ["motion", "starts", "hierarchy"]
     networks += ["decoder"] if isinstance(tree["decoder"], s2d_dec.S2DDec) else []
     moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in networks}
@@ -73,7 +77,7 @@ def load(path: str | os.PathLike | None = None) -> Models:
 
 
 def save(path: str | os.PathLike, models: Models) -> None:
-    """Write models to one safetensors file; `about` gains what `load` needs."""
+    """Write models to one safetensors file, with the metadata that `load` needs."""
     tree = models._asdict()
     refined = isinstance(models.decoder, gpmm_residual.GPMMResidual)
     about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
@@ -85,35 +89,36 @@ def save(path: str | os.PathLike, models: Models) -> None:
     weights.save(path, tree, metadata=about | {"shapes": leaves})
 
 
-def _structure(shapes: dict[str, list], generator: str) -> dict[str, Any]:
-    """The tree to expect, rebuilt from the leaf names, dtypes and shapes that a file states.
+def _structure(shapes: dict[str, list[Any]], generator: str) -> dict[str, Any]:
+    """Return the expected tree, rebuilt from the leaf names, dtypes and shapes in a file's metadata.
 
-    Raises `KeyError` or `TypeError` where the names are not those of our records.
+    Raises:
+      KeyError, TypeError: names that do not match the records.
     """
     flat = {name: jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype)) for name, (dtype, shape) in shapes.items()}
     nested = traverse_util.unflatten_dict(flat, sep="/")
     tables = {f"{table}/{i}": leaf for table, rows in nested["hierarchy"].items() for i, leaf in rows.items()}
-    networks = {}
+    networks: dict[str, Any] = {}
     for name in ("motion", "decoder"):
-        networks[name] = _listed(nested[name].get("weights", {}))
+        networks[name] = _restore_lists(nested[name].get("weights", {}))
     tree = {
         "face": Face(**nested["face"]),
         "motion": generators.KINDS[generator](tangent_pca.TangentPCA(**nested["motion"]["chart"]), networks["motion"]),
         "starts": start_poses.StartPoses(**nested["starts"]),
         "hierarchy": tables,
         "decoder": (
-            _listed(nested["decoder"])
+            _restore_lists(nested["decoder"])
             if "base" in nested["decoder"]
             else s2d_dec.S2DDec(s2d_dec.Scale(**nested["decoder"]["scale"]), networks["decoder"])
         ),
     }
-    # Files of versions before 0.2 hold the template's eyes and teeth too; `load` leaves them out.
+    # Files of versions before 0.2 also contain the template's eyes and teeth, which `load` discards.
     return tree | ({"props": nested["props"]} if "props" in nested else {})
 
 
-def _listed(tree: Any) -> Any:
-    """A nested dict whose numbered entries, "0" to the last, are lists again."""
+def _restore_lists(tree: Any) -> Any:
+    """Return a nested dict in which dicts with keys "0", "1", ... are lists."""
     if not isinstance(tree, dict):
         return tree
-    rows = {name: _listed(rows) for name, rows in tree.items()}
+    rows: dict[str, Any] = {name: _restore_lists(rows) for name, rows in tree.items()}
     return [rows[str(i)] for i in range(len(rows))] if "0" in rows else rows

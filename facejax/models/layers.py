@@ -1,4 +1,4 @@
-"""Dense and spiral-convolution layers: plain dicts of a kernel and a bias, initialised and applied by pure functions."""
+"""Dense and spiral-convolution layers: pure functions on plain dicts of a kernel and a bias."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def dense(layer: Weights, x: Float[Array, "... inputs"]) -> Float[Array, "... ou
     return x @ layer["kernel"] + layer["bias"]
 
 
-def residual_stack(weights: Weights, x: Float[Array, "... inputs"], activation: Activation) -> Float[Array, "... width"]:
+def residual_stack(
+    weights: Weights, x: Float[Array, "... inputs"], activation: Activation
+) -> Float[Array, "... width"]:
     """Apply `weights["stem"]`, then the residual blocks `weights["blocks"]`, each scaled by one over their number."""
     x = activation(dense(weights["stem"], x))
     for block in weights["blocks"]:

@@ -1,7 +1,7 @@
 """A 3D morphable model: faces as a mean and principal components (Blanz & Vetter 1999; Seo & Luo 2021, 2.1).
 
-Any values that examples have at their vertices will do: shape, colours, normals, each with a model of its own.
-`direction` finds what to add to a face for more of an attribute, and `fit_identity_expression` keeps identity and expression apart.
+It models any values at the vertices: shape, colours or normals, each with a model of its own. `direction` finds the
+change of a face that increases an attribute; `fit_identity_expression` models identity and expression separately.
 
     shape = morphable.fit(heads, components=40)
     nearest = morphable.apply(shape, morphable.project(shape, head))
@@ -15,7 +15,7 @@ Vocabulary
   deviation    (k,) standard deviation of the examples along each component, summed over vertices, in the
                values' unit; variances divide by M.
   coefficients (..., k) in standard deviations: the paper's weights alpha_i or beta_i over the deviation.
-  attribute    what a score says of each example: age, femaleness, how hooked a nose is.
+  attribute    a property of which each example has a score: age, femaleness, the curvature of the nose.
 
 Fits work in float64 on the host and return float32.
 """
@@ -27,18 +27,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
+
+from facejax.models import pca
 
 ROUNDING = 1e-6  # of a share of variance, from parameters in float32
-PRECISION = jax.lax.Precision.HIGHEST  # GPUs multiply float32 with ten bits of mantissa unless told otherwise
+PRECISION = jax.lax.Precision.HIGHEST  # by default GPUs multiply float32 with ten bits of mantissa
 
 
 class MorphableModel(NamedTuple):
     """mean + sum_i coefficients[i] deviation[i] components[i]."""
 
-    mean: jax.Array  # (N, C)
-    components: jax.Array  # (k, N, C), orthonormal, the widest first
-    deviation: jax.Array  # (k,)
-    total_variance: jax.Array  # (), of all directions, summed over vertices
+    mean: Array  # (N, C)
+    components: Array  # (k, N, C), orthonormal, the widest first
+    deviation: Array  # (k,)
+    total_variance: Array  # (), of all directions, summed over vertices
 
 
 class IdentityExpressionModel(NamedTuple):
@@ -49,27 +52,35 @@ class IdentityExpressionModel(NamedTuple):
 
 
 def fit(examples: np.ndarray, *, components: int) -> MorphableModel:
-    """Mean and principal components of examples (M, N, C), by a thin singular value decomposition.
+    """Fit the mean and principal components of examples (M, N, C), by a thin singular value decomposition.
 
-    Directions in which nothing varies are no components, so that there may be fewer than asked for. Examples have to
-    fit into memory; `facejax.models.linear.pca.prepare` finds the same components of those that do not.
+    Directions without variance are dropped, so that there may be fewer components than requested. Examples must fit
+    into memory; `facejax.models.decoders.linear.pca.prepare` computes the same components from batches.
 
-    Raises `ValueError` for examples of another shape, not finite or all alike, and for more components than M - 1.
+    Raises:
+      ValueError: examples of another shape, not finite or all equal, or more than M - 1 components.
     """
     return _fit("examples", _examples("examples", examples), "components", components)
 
 
 @jax.jit
-def apply(params: MorphableModel, coefficients: jax.Array) -> jax.Array:
-    """Values (..., N, C) of faces with coefficients (..., k) in standard deviations; zero is the mean."""
+def apply(params: MorphableModel, coefficients: Float[Array | np.ndarray, "*lead k"]) -> Float[Array, "*lead N C"]:
+    """Return the values of faces with coefficients in standard deviations; zero is the mean.
+
+    Raises:
+      ValueError: wrong number of coefficients.
+    """
     return _apply(params, "coefficients", coefficients)
 
 
 @jax.jit
-def project(params: MorphableModel, values: jax.Array) -> jax.Array:
-    """Coefficients (..., k) of the faces nearest to values (..., N, C): `apply` of them is the orthogonal projection.
+def project(params: MorphableModel, values: Float[Array | np.ndarray, "*lead N C"]) -> Float[Array, "*lead k"]:
+    """Return the coefficients of the nearest faces: `apply` of them is the orthogonal projection of the values.
 
-    Coefficients far beyond 3 say that these are no faces like the examples; nothing holds them back.
+    Coefficients are not regularised; magnitudes far above 3 indicate values unlike the examples.
+
+    Raises:
+      ValueError: wrong shape.
     """
     if jnp.shape(values)[-2:] != params.mean.shape:
         n, c = params.mean.shape
@@ -78,19 +89,20 @@ def project(params: MorphableModel, values: jax.Array) -> jax.Array:
     return along / params.deviation
 
 
-def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -> jax.Array:
-    """What to add to a face for more of an attribute, (N, C): sum_i mu_i (S_i - mean), Seo & Luo 2021, equation 1.
+def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -> Array:
+    """Return the change of a face (N, C) that increases an attribute: sum_i mu_i (S_i - mean), Seo & Luo 2021, eq. 1.
 
-    S are examples (M, N, C) and mu their scores (M,). The S_i - mean add up to zero, so that a constant added to mu
-    changes nothing: the sum is M cov(mu, S), and cov(mu, S) itself for mu centred and divided by M. It grows with the
-    number of examples and with the unit of the scores.
+    S are examples (M, N, C) and mu their scores (M,). The S_i - mean sum to zero, so that adding a constant to mu has
+    no effect: the sum is M cov(mu, S), and cov(mu, S) itself for mu centred and divided by M. It scales with the number
+    of examples and with the unit of the scores.
 
     unit=True divides by sum_i mu_i^2, mu centred. That is cov(mu, S) / var(mu), the slope of the regression of faces on
-    scores, in the values' unit per unit of score: added to the face that is expected at a score, it gives the one at
-    that score plus one. A linear regression of scores on faces then rises by one as well where it meets every example's
-    score, as with fewer examples than coordinates, and by its R^2 otherwise.
+    scores, in the values' unit per unit of score: added to the expected face at a score, it gives the expected face at
+    that score plus one. The score that a linear regression predicts from the face then increases by one if the
+    regression interpolates all examples, as with fewer examples than coordinates, and by its R^2 otherwise.
 
-    Raises `ValueError` for wrong shapes, numbers that are not finite, and with `unit` for scores that are all alike.
+    Raises:
+      ValueError: wrong shapes, values that are not finite, or, with `unit`, scores that are all equal.
     """
     examples, scores = _examples("examples", examples), np.asarray(scores, np.float64)
     if scores.shape != examples.shape[:1]:
@@ -107,13 +119,19 @@ def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -
 def fit_identity_expression(
     neutral: np.ndarray, displacements: np.ndarray, *, identity: int, expression: int
 ) -> IdentityExpressionModel:
-    """Identity and expression apart, with so many components each.
+    """Fit separate models of identity and expression.
 
-    From neutral faces (P, N, 3), one per subject, and from F frames' displacements (F, N, 3), each from its own
-    subject's neutral, both in mm. The model of expressions is the expression-specific 3DMM of Otberdout et al. 2023,
-    4.2: principal components of such displacements, which `facejax.models.linear.pca` fits to landmarks.
+    The expression model is the expression-specific 3DMM of Otberdout et al. 2023, 4.2: principal components of
+    displacements, which `facejax.models.decoders.linear.pca` fits to landmarks.
 
-    Raises `ValueError` where `fit` does, and for vertices that do not correspond.
+    Args:
+      neutral: (P, N, 3) neutral faces in mm, one per subject.
+      displacements: (F, N, 3) frames in mm, each relative to its own subject's neutral.
+      identity: number of identity components.
+      expression: number of expression components.
+
+    Raises:
+      ValueError: as `fit`, or different numbers of vertices.
     """
     neutral, displacements = _examples("neutral", neutral), _examples("displacements", displacements)
     if neutral.shape[1:] != displacements.shape[1:] or neutral.shape[2] != 3:
@@ -127,11 +145,14 @@ def fit_identity_expression(
 
 
 @jax.jit
-def face(model: IdentityExpressionModel, identity: jax.Array, expression: jax.Array) -> jax.Array:
-    """Vertices (..., N, 3) in mm, of identity coefficients (..., k) and expression coefficients (..., l).
+def face(model: IdentityExpressionModel, identity: Array, expression: Array) -> Array:
+    """Return vertices (..., N, 3) in mm from identity coefficients (..., k) and expression coefficients (..., l).
 
-    Their leading axes broadcast: one identity does for all frames. Zero expression coefficients are the mean
-    expression; neutral's are `project(two.expression, zeros)`, as near as the components come to it.
+    Leading axes broadcast: one identity serves all frames. Zero expression coefficients are the mean expression; the
+    neutral expression is `project(model.expression, zeros)`, up to the truncation of the components.
+
+    Raises:
+      ValueError: wrong numbers of coefficients, or leading axes that do not broadcast.
     """
     try:
         jnp.broadcast_shapes(jnp.shape(identity)[:-1], jnp.shape(expression)[:-1])
@@ -142,14 +163,15 @@ def face(model: IdentityExpressionModel, identity: jax.Array, expression: jax.Ar
 
 
 def variance_kept(params: MorphableModel) -> np.ndarray:
-    """Share of the examples' variance (k,) that the first 1 ... k components keep, float64 on the host."""
+    """Return the share of the examples' variance kept by the first 1 ... k components, (k,) float64 on the host."""
     return np.cumsum(np.square(params.deviation, dtype=np.float64)) / np.float64(params.total_variance)
 
 
 def components_for(params: MorphableModel, share: float) -> int:
-    """The least number of components that keep a share of the variance, such as 0.99.
+    """Return the least number of components that keep a share of the variance, such as 0.99.
 
-    Raises `ValueError` for a share that is not in (0, 1], or that all k components do not keep.
+    Raises:
+      ValueError: a share outside (0, 1], or larger than all k components keep.
     """
     if not 0 < share <= 1:
         raise ValueError(f"share: expected more than 0 and at most 1, got {share}")
@@ -161,30 +183,30 @@ def components_for(params: MorphableModel, share: float) -> int:
 
 
 def _fit(name: str, examples: np.ndarray, option: str, components: int) -> MorphableModel:
-    """`fit`, with the caller's own names for what is wrong."""
+    """Fit a model; `name` and `option` are the caller's argument names for error messages."""
     count = len(examples)
     if not 1 <= components < count:
         raise ValueError(f"{option}: expected 1 to {count - 1} components of {count} examples, got {components}")
     flat = examples.reshape(count, -1)
-    # About the first example: those that are all alike then leave zeros, and no rounding to take for a component.
+    # Relative to the first example: equal examples then give exact zeros, not rounding errors.
     centred = flat - flat[0]
     if not centred.any():
         raise ValueError(f"{name}: expected at least two that differ, got {count} alike")
     shift = centred.mean(axis=0)
     centred -= shift
-    _, singular, right = np.linalg.svd(centred, full_matrices=False)
+    axes, singular = pca.from_samples(centred)
     k = min(components, int(np.sum(singular > 1e-6 * singular[0])))
     fitted = (
         (flat[0] + shift).reshape(examples.shape[1:]),
-        right[:k].reshape(k, *examples.shape[1:]),
+        axes[:k].reshape(k, *examples.shape[1:]),
         singular[:k] / np.sqrt(count),
         np.sum(singular**2) / count,
     )
     return MorphableModel(*(jnp.asarray(x, jnp.float32) for x in fitted))
 
 
-def _apply(params: MorphableModel, name: str, coefficients: jax.Array) -> jax.Array:
-    """`apply`, with the caller's own name for the coefficients."""
+def _apply(params: MorphableModel, name: str, coefficients: Array) -> Array:
+    """Apply a model; `name` is the caller's argument name for error messages."""
     if jnp.shape(coefficients)[-1:] != params.deviation.shape:
         raise ValueError(f"{name}: expected (..., {len(params.deviation)}), got {jnp.shape(coefficients)}")
     along = coefficients * params.deviation
@@ -192,7 +214,7 @@ def _apply(params: MorphableModel, name: str, coefficients: jax.Array) -> jax.Ar
 
 
 def _examples(name: str, values: np.ndarray) -> np.ndarray:
-    """Examples (M, N, C) in float64, two or more."""
+    """Return examples (M, N, C) in float64, after checking them."""
     values = np.asarray(values, np.float64)
     if values.ndim != 3 or len(values) < 2 or values.size == 0:
         raise ValueError(f"{name}: expected (M, N, C) with M of 2 or more, got {values.shape}")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 def from_samples(
     centred: Float[np.ndarray, "M D"],
-) -> tuple[Float[np.ndarray, "k D"], Float[np.ndarray, "k"]]:
+) -> tuple[Float[np.ndarray, "k D"], Float[np.ndarray, " k"]]:
     """Return all components (rows) and singular values of centred samples by a thin singular value decomposition.
 
     k is the smaller of M and D. The standard deviation along a component is its singular value over sqrt(M).
@@ -23,7 +23,7 @@ def from_samples(
 
 def from_covariance(
     covariance: Float[np.ndarray, "D D"],
-) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
+) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, "D D"]]:
     """Return the variances, descending, and the components (columns) of a covariance or Gram matrix."""
     variance, components = np.linalg.eigh(covariance)
     return variance[::-1], components[:, ::-1]

@@ -1,12 +1,11 @@
-"""Training loops that know no model: functions in, state out, the same numbers after any interruption.
+"""Model-independent training loop: pure step functions in, state out, with exact resumption after interruption.
 
-Vocabulary: a *step* is a pure function `step(state, batch, constants) -> (state, metrics)`; metrics are a
-dict of scalars. `constants` hold what does not change (index tables, data on the device): passed as an
-argument, because arrays closed over would be folded into the program at compile time. A *chunk* is a number
-of steps scanned on the device in one call. `batches(first, count)` gives the data of `count` steps with
-leading axes (count, batch), and depends on nothing else; random keys are folded from the step index. So the
-state at a step is a function of that step alone, and a run that was killed and resumed cannot differ from
-one that was not.
+Vocabulary: a *step* is a pure function `step(state, batch, constants) -> (state, metrics)`; metrics are a dict of
+scalars. `constants` do not change (index tables, data on the device); they are an argument, because arrays that are
+closed over would be folded into the program at compile time. A *chunk* is a number of steps scanned on the device in
+one call. `batches(first, count)` returns the data of `count` steps with leading axes (count, batch), as a function of
+its arguments alone; random keys are folded from the step index. So the state at a step is a function of that step, and
+a run that was killed and resumed equals one that was not.
 """
 
 import os
@@ -34,7 +33,7 @@ Step = Callable[["TrainState", Tree, Tree], tuple["TrainState", Metrics]]
 
 
 class TrainState(NamedTuple):
-    """Everything that changes while training."""
+    """Everything that changes during training."""
 
     step: jax.Array  # () int32, steps done
     params: Tree
@@ -44,14 +43,17 @@ class TrainState(NamedTuple):
 
 
 class TrainingError(RuntimeError):
-    """A loss that is no longer a number, or past all bounds."""
+    """A metric that is not finite or exceeds the limit, a lost process, or a file that cannot be written."""
 
 
 def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.ndarray]:
-    """`indices(first, count)`: which of `size` samples `count` steps see, (count, batch) int32.
+    """Return `indices(first, count)`: the samples, of `size`, of `count` steps, (count, batch) int32.
 
-    Epoch after epoch in an order drawn from (seed, epoch), end to end: each sample comes once an epoch,
-    none is dropped, and a batch may reach over into the next epoch.
+    Epochs are shuffled by (seed, epoch) and concatenated: each sample occurs once per epoch, none is dropped, and a
+    batch may extend into the next epoch.
+
+    Raises:
+      ValueError: a size or batch below 1.
     """
     if size < 1 or batch < 1:
         raise ValueError(f"size and batch must be at least 1; got {size} and {batch}")
@@ -70,7 +72,7 @@ def epoch_indices(seed: int, size: int, batch: int) -> Callable[[int, int], np.n
 
 
 def gather_batches(step: Step) -> Step:
-    """Let `step` take indices as its batch and (data, constants) as constants: data stay on the device."""
+    """Return a step that takes indices as batch and (data, constants) as constants, so that data stay on the device."""
     return lambda state, indices, held: step(state, jax.tree.map(lambda leaf: leaf[indices], held[0]), held[1])
 
 
@@ -89,26 +91,31 @@ def run(
     resume: bool = True,
     limit: float = 1e6,
     tensorboard: bool = False,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> TrainState:
-    """Train until `steps` steps are done, counted from the very first start, and return the state.
+    """Train until `steps` steps are done, counted from the first start, and return the state.
 
-    Writes to `folder`: `metrics.jsonl` (one line a chunk: the means over its steps) and `checkpoints/`
-    (every `save_steps` steps or `save_seconds` seconds, whichever comes first, at the end of a chunk; the
-    newest `keep`). With `resume`, goes on from the newest checkpoint, if there is one, and cuts
-    `metrics.jsonl` back to it. SIGTERM and Ctrl-C save, then leave as usual (`SystemExit`,
-    `KeyboardInterrupt`); a second one leaves at once. Raises `ValueError` where `folder` holds
-    a longer run, and `TrainingError` on a metric that is not finite or beyond `limit`, with the step and its name, and
-    where a checkpoint cannot be written.
+    Writes to `folder`: `metrics.jsonl` (one line per chunk, the means over its steps) and `checkpoints/`. SIGTERM and
+    Ctrl-C save a checkpoint, then exit as usual (`SystemExit`, `KeyboardInterrupt`); a second one exits at once.
 
-    With a `mesh` (`parallel.line`) every batch is shared out along its first axis among the devices, which may be those
-    of several processes: each calls with the same arguments, the first one reads and writes `folder`, and the numbers
-    are those of one device but for the order of sums. A run may go on with another number of devices or processes. A
-    process that is lost stops the others within a minute.
+    Args:
+      save_steps, save_seconds: save at the end of the chunk in which either is reached, whichever comes first.
+      keep: checkpoints that stay on disk.
+      resume: continue from the newest checkpoint, if there is one, and truncate `metrics.jsonl` to it.
+      limit: largest absolute value of a metric.
+      device_mesh: from `sharding.data_mesh`. Each batch is split along its first axis among the devices, which may
+        belong to several processes: each calls with the same arguments, the primary one reads and writes `folder`, and
+        the results are those of one device except for the order of sums. A run may resume with another number of
+        devices or processes. If a process is lost, the others stop within a minute.
+
+    Raises:
+      ValueError: `folder` holds a longer run, or a run without `resume`.
+      TrainingError: a metric that is not finite or beyond `limit` (with step and name), or a lost process.
+      CheckpointError: a checkpoint that cannot be read or written.
     """
     folder = Path(folder)
-    if mesh is not None:
-        step = sharding.data_parallel(step, mesh=mesh)
+    if device_mesh is not None:
+        step = sharding.data_parallel(step, device_mesh=device_mesh)
 
     def several(state: TrainState, data: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         if chunk == 1:  # no loop: within one, XLA runs convolutions on a CPU several times slower
@@ -116,9 +123,9 @@ def run(
             return state, jax.tree.map(lambda value: value[None], metrics)
         return jax.lax.scan(lambda state, batch: step(state, batch, constants), state, data)
 
-    # Whole on every device, so that any process can read what comes out.
-    laid_out = {} if mesh is None else {"out_shardings": sharding.replicated(mesh)}
-    advance = jax.jit(several, donate_argnums=0, **laid_out)
+    # Replicated, so that any process can read the outputs.
+    out_shardings = None if device_mesh is None else sharding.replicated(device_mesh)
+    advance = jax.jit(several, donate_argnums=0, out_shardings=out_shardings)
     with _Saved(folder / "checkpoints", keep) as saved, _stop_signals() as stopped:
         if not resume and saved.latest is not None:
             raise ValueError(f"{folder} holds a run of {saved.latest} steps: resume it, or name another folder")
@@ -129,39 +136,39 @@ def run(
             raise ValueError(
                 f"{folder} holds a run of {done} steps, more than {steps}: ask for more, or name another folder"
             )
-        if mesh is not None:
-            whole, split = sharding.replicated(mesh), sharding.split_along(mesh, 1)
+        if device_mesh is not None:
+            whole, split = sharding.replicated(device_mesh), sharding.split_along(device_mesh, 1)
             state, constants = sharding.shard(state, whole), sharding.shard(constants, whole)
 
         def prepared(first: int) -> Tree:
             data = batches(first, min(chunk - first % chunk, steps - first))
-            if mesh is None:
+            if device_mesh is None:
                 return data
-            sharding.check_divisible(data, mesh, 1)
+            sharding.check_divisible(data, device_mesh, 1)
             return sharding.shard(data, split)
 
         saved_at, stopping = time.monotonic(), False
         with (
             MetricLogger(folder, done, steps, tensorboard=tensorboard)
             if sharding.is_primary()
-            else NullLogger() as journal
+            else NullLogger() as logger
         ):
             data = prepared(done) if done < steps else None
             while done < steps and not stopping:
                 began = time.monotonic()
                 first, count = done, jax.tree.leaves(data)[0].shape[0]
-                with _company(first, saved, folder):
+                with _process_loss(first, saved, folder):
                     state, metrics = advance(state, data, constants)
                     done += count
                     if done < steps:  # prepared while the device is busy
                         data = prepared(done)
                     metrics = jax.device_get(metrics)
-                    # A step that only some of them take would never end.
+                    # Processes stop together: a step that only some of them take would never end.
                     stopping = bool(sharding.max_over_processes(len(stopped)))
                 _check(metrics, first, limit, saved.latest, folder)
                 means = {name: float(np.mean(values, dtype=np.float64)) for name, values in metrics.items()}
                 try:
-                    journal.write(done, means, seconds=time.monotonic() - began)
+                    logger.write(done, means, seconds=time.monotonic() - began)
                 except OSError as error:
                     why = f"{folder}: metrics.jsonl cannot be written ({error.strerror})"
                     raise TrainingError(f"{why}; {_last(saved.on_disk())}") from error
@@ -175,7 +182,7 @@ def run(
 
 
 class _Saved:
-    """The checkpoints of a run that several processes may share: the first one reads and writes."""
+    """The checkpoints of a run that several processes may share: the primary one reads and writes."""
 
     def __init__(self, folder: Path, keep: int):
         self._checkpoints = Checkpoints(folder, keep=keep) if sharding.is_primary() else None
@@ -191,11 +198,11 @@ class _Saved:
             self._checkpoints.close()
 
     def on_disk(self) -> int | None:
-        """The newest checkpoint that is whole by now."""
+        """Return the newest checkpoint that is complete on disk."""
         return self._checkpoints.on_disk() if self._checkpoints else self.latest
 
     def restored(self, state: TrainState) -> TrainState:
-        """The newest checkpoint in all processes, or the state that is given."""
+        """Return the newest checkpoint in all processes, or the given state if there is none."""
         if self.latest is None:
             return state
         if self._checkpoints:
@@ -203,14 +210,15 @@ class _Saved:
         return sharding.broadcast_from_primary(state)
 
     def save(self, step: int, state: TrainState) -> None:
+        """Write a checkpoint, if this process is the primary one."""
         if self._checkpoints:
             self._checkpoints.save(step, sharding.unshard(state) if jax.process_count() > 1 else state)
         self.latest = step
 
 
 @contextmanager
-def _company(step: int, saved: _Saved, folder: Path):
-    """Say what to do where another process is gone."""
+def _process_loss(step: int, saved: _Saved, folder: Path):
+    """Raise `TrainingError` with instructions if another process is lost."""
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
@@ -218,12 +226,12 @@ def _company(step: int, saved: _Saved, folder: Path):
             raise
         raise TrainingError(
             f"another process was lost after step {step} ({str(error).splitlines()[0][:200]}); {_last(saved.latest)}, "
-            f"in {folder}: start again, with as many processes as there are"
+            f"in {folder}: restart all processes to resume"
         ) from error
 
 
 def _check(metrics: dict[str, np.ndarray], first: int, limit: float, saved: int | None, folder: Path) -> None:
-    """Raise on the earliest bad value of a chunk: `metrics` (steps,) each, `first` steps done before it."""
+    """Raise for the earliest bad value of a chunk: `metrics` (steps,) each, after `first` steps."""
     wrong = {name: ~(np.abs(values) <= limit) for name, values in metrics.items()}  # true for NaN too
     bad = [(int(np.argmax(where)), name) for name, where in wrong.items() if where.any()]
     if bad:
@@ -237,16 +245,16 @@ def _last(saved: int | None) -> str:
 
 @contextmanager
 def _stop_signals():
-    """A list that receives SIGTERM or SIGINT; the same signal a second time acts as it did before."""
+    """Yield a list that receives SIGTERM or SIGINT; a second signal has its previous effect."""
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield received  # only the main thread can be told
+        yield received  # signals are delivered to the main thread only
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
     def receive(number: int, _: object) -> None:
         received.append(number)
-        signal.signal(number, before[number] or signal.SIG_DFL)
+        signal.signal(number, before[signal.Signals(number)] or signal.SIG_DFL)
 
     for number in before:
         signal.signal(number, receive)
@@ -254,5 +262,5 @@ def _stop_signals():
         yield received
     finally:
         for number, handler in before.items():
-            # None: it was set by a library in C, and cannot be set again from here.
+            # None: the handler was installed from C and cannot be restored from Python.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

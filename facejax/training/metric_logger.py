@@ -1,4 +1,4 @@
-"""The record of a run as it goes: a JSON line per entry, a progress bar, and TensorBoard if asked for."""
+"""Metrics of a training run: a JSON line per entry, a progress bar, and optionally TensorBoard."""
 
 import json
 import os
@@ -18,9 +18,9 @@ _QUIET = 10.0  # seconds between two plain lines
 class MetricLogger:
     """Appends to `folder/metrics.jsonl` and shows progress; a context manager.
 
-    Entries past step `done` are cut away first: a run that was killed wrote them after its last checkpoint.
-    On a terminal there is a bar, elsewhere a line now and then, both on standard error. `tensorboard` needs
-    the extra of that name.
+    Entries after step `done` are removed first: a killed run wrote them after its last checkpoint. Progress goes to
+    standard error, as a bar on a terminal and as occasional lines elsewhere. `tensorboard` requires the extra of that
+    name.
     """
 
     def __init__(self, folder: str | os.PathLike, done: int, steps: int, *, tensorboard: bool = False):
@@ -31,7 +31,7 @@ class MetricLogger:
         _truncate(self.path, done)
         self._file = self.path.open("a", encoding="utf-8")
         self._steps = steps
-        self._spoke = -float("inf")
+        self._printed = -float("inf")
         self._bar = None
         if sys.stderr.isatty():
             columns = (
@@ -55,12 +55,12 @@ class MetricLogger:
             if self._events:
                 self._events.close()
         except OSError:
-            if kind is None:  # of a full disk, what has been raised already says more
+            if kind is None:  # do not replace an error already raised, such as a full disk
                 raise
 
     def write(self, step: int, metrics: dict[str, float], *, seconds: float) -> None:
-        """Record `metrics` of the steps up to `step`, which took `seconds`."""
-        # One call and one flush a line, so that a kill can only cut the last line short.
+        """Append the metrics of the steps up to `step`, which took `seconds`."""
+        # One write and one flush per line, so that a kill can truncate the last line only.
         self._file.write(json.dumps({"step": step, **metrics, "seconds": round(seconds, 4)}) + "\n")
         self._file.flush()
         if self._events:
@@ -69,13 +69,13 @@ class MetricLogger:
         note = "  ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         if self._bar:
             self._bar.update(self._task, completed=step, note=note)
-        elif time.monotonic() - self._spoke >= _QUIET or step >= self._steps:
-            self._spoke = time.monotonic()
+        elif time.monotonic() - self._printed >= _QUIET or step >= self._steps:
+            self._printed = time.monotonic()
             print(f"step {step}/{self._steps}  {note}", file=sys.stderr, flush=True)
 
 
 class NullLogger:
-    """A journal that keeps nothing, for processes that only help."""
+    """No-op logger for non-primary processes."""
 
     def __enter__(self) -> "NullLogger":
         return self
@@ -84,11 +84,11 @@ class NullLogger:
         pass
 
     def write(self, step: int, metrics: dict[str, float], *, seconds: float) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 def read(folder: str | os.PathLike) -> list[dict[str, float]]:
-    """The entries of a run, oldest first; a last line cut short by a kill is left out."""
+    """Return the entries of a run, oldest first; a truncated last line is skipped."""
     entries = []
     path = Path(folder) / "metrics.jsonl"
     for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
@@ -100,9 +100,12 @@ def read(folder: str | os.PathLike) -> list[dict[str, float]]:
 
 
 def claim_folder(folder: str | os.PathLike, what: dict[str, Any]) -> None:
-    """Write down what a run folder is for; raise `ValueError` where it holds a run of something else.
+    """Record the configuration of a run in its folder.
 
-    A checkpoint of the right shapes would else be resumed with another seed, plan or dataset.
+    Without it, a checkpoint of matching shapes could be resumed with another seed, plan or dataset.
+
+    Raises:
+      ValueError: the folder holds a run with another configuration, or its record is damaged.
     """
     path = Path(folder) / "run.json"
     what = json.loads(json.dumps(what))
@@ -127,7 +130,7 @@ def _truncate(path: Path, done: int) -> None:
 
 def _event_writer(folder: Path):
     try:
-        from tensorboardX import SummaryWriter
+        from tensorboardX import SummaryWriter  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ModuleNotFoundError("TensorBoard output needs: pip install 'facejax[tensorboard]'") from None
     return SummaryWriter(str(folder / "tensorboard"))

@@ -1,7 +1,6 @@
-"""Training steps for `facejax.training.run`: down a loss, or one round of the adversarial game.
+"""Training steps for `facejax.training.loop.run`: supervised, adversarial, and vectorised over models.
 
-Each maker takes functions and returns `step(state, batch, constants) -> (state, metrics)`; none knows a
-model.
+Each maker takes functions and returns a model-independent `step(state, batch, constants) -> (state, metrics)`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,14 +18,14 @@ from facejax.training.loop import Metrics, Step, TrainState, Tree
 
 
 class Players(NamedTuple):
-    """The two sides of the adversarial game: parameters, optimisers, or optimiser states."""
+    """Parameters, optimisers, or optimiser states of generator and critic."""
 
     generator: Any
     critic: Any
 
 
 def supervised(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
-    """A step down the gradient of `loss(params, key, batch, constants) -> (scalar, metrics)`."""
+    """Return an optimiser step on `loss(params, key, batch, constants) -> (scalar, metrics)`."""
 
     def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         key = jax.random.fold_in(state.key, state.step)
@@ -41,12 +40,12 @@ def supervised(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
 
 
 def init_supervised(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
-    """The state that `supervised` starts from."""
+    """Return the initial state of `supervised`."""
     return TrainState(jnp.int32(0), params, optimiser.init(params), key)
 
 
 def with_moving_average(step: Step, decay: float) -> Step:
-    """`step`, and in `extra` the exponential moving average of the parameters; let it start as the parameters."""
+    """Return a step that keeps the exponential moving average of the parameters in `extra`; initialise it to them."""
 
     def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         following, metrics = step(state, batch, constants)
@@ -56,20 +55,24 @@ def with_moving_average(step: Step, decay: float) -> Step:
     return stepped
 
 
-def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int]) -> Step:
-    """One step of E models that know nothing of each other: parameters, optimiser states, batches stacked, (E, ...).
+def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int] | np.ndarray) -> Step:
+    """Return one step of E independent models: parameters, optimiser states and batches are stacked, (E, ...).
 
-    `step` sees one of them, with constants (own, shared) of which `own` comes stacked too, and a key made of the run's
-    and its id: the same numbers alone as in company. Metrics are means over the models; the loss by name as well.
+    `step` receives one model, with constants (own, shared) of which `own` is stacked too, and a key derived from the
+    run's key and the model's id: a model gets the same numbers alone as in a stack. Metrics are means over the models,
+    and the loss of each by name.
 
-    Where the process has several devices, they share the models out among them. On a CPU that is worth it too, since
-    the small products of one network keep one core busy: `jax.config.update("jax_num_cpu_devices", cores)` before
-    anything else (six networks of three layers of 128 on two cores: 39 ms instead of 59). On one CPU device the models
-    take turns: a batched small product runs through no fast kernel (72 ms under `vmap`). Elsewhere it is a `vmap`.
+    The models are split among the process's devices. On a CPU several devices help too, since the small products of one
+    network use one core: set `jax.config.update("jax_num_cpu_devices", cores)` first (six networks of three layers of
+    128 on two cores: 39 ms instead of 59). On one CPU device the models are mapped one after another, because batched
+    small products have no fast kernel (72 ms under `vmap`). On other devices it is a `vmap`.
+
+    Raises:
+      ValueError: names that are not unique or not one per id.
     """
     if len(names) != len(ids) or len(set(names)) < len(names):
-        raise ValueError(f"names: expected one of its own for each of {len(ids)} models, got {list(names)}")
-    ids = jnp.asarray(ids)
+        raise ValueError(f"names: expected {len(ids)} unique names, one per model, got {list(names)}")
+    model_ids = jnp.asarray(ids)
 
     def one(common, parts):
         (number_of_steps, run_key, shared), (params, opt_state, extra, number, batch, own) = common, parts
@@ -83,15 +86,15 @@ def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int]) -> St
 
     def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         own, shared = constants
-        devices = jax.local_devices()  # other processes, where there are any, do the same
+        devices = jax.local_devices()  # every process does the same work on its own devices
         count = max(n for n in range(1, len(devices) + 1) if len(ids) % n == 0)
-        apart = several
+        mapped = several
         if count > 1:
             mesh, split = Mesh(np.array(devices[:count]), ("models",)), PartitionSpec("models")
             specs = {"in_specs": (PartitionSpec(), split), "out_specs": split}
-            apart = jax.shard_map(several, mesh=mesh, check_vma=False, **specs)
-        stacked = (state.params, state.opt_state, state.extra, ids, batch, own)
-        (params, opt_state, extra), metrics = apart((state.step, state.key, shared), stacked)
+            mapped = jax.shard_map(several, mesh=mesh, check_vma=False, **specs)
+        stacked = (state.params, state.opt_state, state.extra, model_ids, batch, own)
+        (params, opt_state, extra), metrics = mapped((state.step, state.key, shared), stacked)
         means = {name: jnp.mean(values) for name, values in metrics.items()}
         losses = {f"loss_{name}": metrics["loss"][i] for i, name in enumerate(names)} if len(names) > 1 else {}
         return TrainState(state.step + 1, params, opt_state, state.key, extra), means | losses
@@ -100,7 +103,7 @@ def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int]) -> St
 
 
 def init_vectorized_models(params: Tree, optimiser: optax.GradientTransformation, key: jax.Array) -> TrainState:
-    """The state that `vectorize_models` of `supervised` steps starts from; every leaf of `params` is stacked, (E, ...)."""
+    """Return the initial state of vectorised `supervised` steps; leaves of `params` are stacked, (E, ...)."""
     return TrainState(jnp.int32(0), params, jax.vmap(optimiser.init)(params), key)
 
 
@@ -114,14 +117,19 @@ def adversarial(
     terms: Callable | None = None,
     decay: float = 0.999,
 ) -> Step:
-    """A Wasserstein step with gradient penalty: `critic_steps` of the critic, then one of the generator.
+    """Return a Wasserstein GAN step with gradient penalty: `critic_steps` critic updates, then one of the generator.
 
-    `generate(weights, constants, key, condition) -> sample` and `score(weights, constants, sample,
-    condition) -> scalar` handle ONE sample. A batch is (real samples, conditions) with a leading axis of
-    critic_steps * B; each critic step takes B of them, and the generator sees the last B. `terms(constants,
-    fake, real, condition)` gives a dict of weighted batch losses to add to the generator's. `extra` of the
-    state is the exponential moving average of the generator's weights: with a critic that never settles,
-    the average is better than any single point.
+    `extra` of the state is the exponential moving average of the generator's weights, which is better than any single
+    iterate because adversarial training does not converge.
+
+    Args:
+      generate: `generate(weights, constants, key, condition) -> sample`, of ONE sample.
+      score: `score(weights, constants, sample, condition) -> scalar`, of ONE sample.
+      critic_steps: a batch is (real samples, conditions) with a leading axis of critic_steps * B; each critic update
+        uses B of them, the generator's the last B.
+      penalty: weight of the gradient penalty.
+      terms: `terms(constants, fake, real, condition)` returns a dict of weighted losses to add to the generator's.
+      decay: of the moving average.
     """
 
     def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
@@ -132,7 +140,7 @@ def adversarial(
             raise ValueError(f"a batch needs a multiple of critic_steps = {critic_steps} samples; got {size}")
         many = jax.vmap(generate, (None, None, 0, 0))
 
-        # One call for the fakes of all critic steps: the generator does not move meanwhile.
+        # One call for the fakes of all critic updates, during which the generator is constant.
         fake = many(generator, constants, jax.random.split(noise_key, size), batch[1])
         rounds = jax.tree.map(lambda leaf: leaf.reshape(critic_steps, -1, *leaf.shape[1:]), (*batch, fake))
 
@@ -171,7 +179,7 @@ def adversarial(
 
 
 def init_adversarial(params: Players, optimisers: Players, key: jax.Array) -> TrainState:
-    """The state that `adversarial` starts from."""
+    """Return the initial state of `adversarial`."""
     opt_state = Players(*(optimiser.init(side) for optimiser, side in zip(optimisers, params, strict=True)))
     return TrainState(jnp.int32(0), params, opt_state, key, extra=params.generator)
 

@@ -30,7 +30,7 @@ def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.nda
             raise ValueError(f"expected {count} {name} labels, got {len(labels)}")
     height, width = shape[:2]
     size = max(11, min(height, width) // 14)
-    font = ImageFont.load_default(size=size)
+    font = _load_font(size)
     row_boxes = [font.getbbox(text) for text in row_labels]
     left = int(max((box[2] for box in row_boxes), default=-8)) + 12 if row_labels else gap
     line = int(sum(font.getmetrics()) * 1.5)
@@ -82,9 +82,15 @@ def caption(pictures, captions) -> np.ndarray:
     return result
 
 
+def _load_font(size: float) -> ImageFont.FreeTypeFont:
+    font = ImageFont.load_default(size=size)
+    assert isinstance(font, ImageFont.FreeTypeFont)  # wherever Pillow is built with FreeType, as its wheels are
+    return font
+
+
 def _font(text: str, size: int, width: float):
     """Return Pillow's built-in font at the given size, or smaller if the text is wider than `width`."""
-    while (font := ImageFont.load_default(size=size)).getlength(text) > width and size > 6:
+    while (font := _load_font(size)).getlength(text) > width and size > 6:
         size -= 1
     return font
 

@@ -1,8 +1,8 @@
 """Rasterise triangles with a z-buffer in NumPy: find the nearest triangle of every sample.
 
-Every triangle is cut into rows and every row into one span of samples: the work grows with the samples covered, not with
-bounding boxes, and no Python loop runs over triangles. Barycentric coordinates and 1/depth are affine on the screen, so
-that a row needs one value and one slope. N vertices, F triangles, S samples.
+Every triangle is cut into rows and every row into one span of samples: the work grows with the samples covered, not
+with bounding boxes, and no Python loop runs over triangles. Barycentric coordinates and 1/depth are affine on the
+screen, so that a row needs one value and one slope. N vertices, F triangles, S samples.
 """
 
 from typing import NamedTuple

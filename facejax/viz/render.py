@@ -185,7 +185,7 @@ def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples
     near = weight[0] + weight[1] + weight[2]
     weight /= near
     attribute = np.concatenate([normals, colours], 1).astype(np.float32)
-    value = sum(weight[i, :, None] * np.take(attribute, corner[i], axis=0) for i in range(3))
+    value = np.asarray(sum(weight[i, :, None] * np.take(attribute, corner[i], axis=0) for i in range(3)))
     light = shading.shade(value[:, :3], value[:, 3:], gloss[hits.face])
     edge = screen[faces]
     ab, ac = edge[:, 1] - edge[:, 0], edge[:, 2] - edge[:, 0]
@@ -199,7 +199,7 @@ def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples
         _stamp(picture, depth.reshape(height, width), dots, view)
     # Adding strided pictures is ten times as fast as a mean over two short axes.
     grid = [picture[i::samples, j::samples] for i in range(samples) for j in range(samples)]
-    return shading.encode(sum(grid) / len(grid))
+    return shading.encode(np.asarray(sum(grid)) / len(grid))
 
 
 def _project(points: np.ndarray, view: Camera, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:

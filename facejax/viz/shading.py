@@ -1,7 +1,7 @@
 """Shading of a face: lights, sRGB, and cavity darkening.
 
-Lights and viewer are far away, so light is a function of the camera-space normal alone: it is tabulated once and light_at
-up for every sample. Concave regions are darkened by the mesh's curvature, which makes wrinkles visible.
+Lights and viewer are far away, so light is a function of the camera-space normal alone: it is tabulated once and read
+for every sample. Concave regions are darkened by the mesh's curvature, which makes wrinkles visible.
 N vertices, S samples.
 """
 

@@ -4,6 +4,7 @@ import importlib.util
 import os
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -39,7 +40,7 @@ def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
         return
     first, *rest = [Image.fromarray(frame) for frame in frames]
     durations = _durations(len(frames), fps, 10 if suffix == ".gif" else 1)
-    options = {"quality": quality, "method": 4} if suffix == ".webp" else {"disposal": 1}
+    options: dict[str, Any] = {"quality": quality, "method": 4} if suffix == ".webp" else {"disposal": 1}
     with atomic.replace_file(path) as temporary:
         first.save(temporary, save_all=True, append_images=rest, duration=durations, loop=0, **options)
 
@@ -61,7 +62,7 @@ def _durations(count: int, fps: float, unit: int) -> list[int]:
 
 
 def _write_mp4(path: Path, frames: np.ndarray, fps: float, quality: int) -> None:
-    import imageio_ffmpeg
+    import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
 
     # Most players need 4:2:0 colour, hence even sides: the last row or column is repeated where necessary.
     even = np.pad(frames, ((0, 0), (0, frames.shape[1] % 2), (0, frames.shape[2] % 2), (0, 0)), mode="edge")

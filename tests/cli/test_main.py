@@ -184,7 +184,7 @@ def test_own_meshes_become_a_dataset(capsys, tmp_path, capture):
     np.testing.assert_allclose(np.linalg.norm(data.vertices[4], axis=-1), 110, atol=1e-3)
     # A dataset is not written over.
     code, printed, err = run(capsys, "data", "prepare", "folder", *options)
-    assert code == 2 and printed == "" and err.count("\n") == 1 and "own: is there already; remove it" in err
+    assert code == 2 and printed == "" and err.count("\n") == 1 and "own: already exists; remove it" in err
 
 
 def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
@@ -200,7 +200,7 @@ def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
     assert "big smile/000004.ply" in told("--landmarks", marks, "--unit", "m")
     (root / "S1" / "big smile" / "000004.ply").unlink()
     assert "big smile: frame 4 is missing, after 000003.ply; --gaps takes" in told("--landmarks", marks)
-    assert "folder: has no --template" in told("--landmarks", marks, "--template", marks)
+    assert "--template is not supported by the folder importer" in told("--landmarks", marks, "--template", marks)
     assert {path.name for path in tmp_path.iterdir()} == {"root", "marks.json"}
 
 
@@ -287,7 +287,7 @@ def test_a_recording_moves_a_makehuman_face_and_any_other(capsys, tmp_path, odd_
         capsys, "animate", "--livelink", take, "--seconds", "1.2", "--person", 102, "--formats", "npz", "--out",
         tmp_path / "own",
     )  # fmt: skip
-    assert code == 0 and "timecode read as 30" in err and "took 1.2 s from 0 s on" in err
+    assert code == 0 and "timecode read as 30" in err and "used 1.2 s of 1.3 s, from 0 s on" in err
     own, _, extra = io.meshes.read_animation(tmp_path / "own" / "S102-take.npz")
     assert own.shape == (36, 3260, 3)
     chin = extra["landmarks"][:, 8, 1]
@@ -316,16 +316,20 @@ def test_bad_requests_to_animate_get_one_line(capsys, tmp_path, networks, odd_he
     assert "got --expression and --end" in told(*ours, "--end", "anger")
     assert "'feer': did you mean fear" in told("--expression", "feer", "--model", networks)
     assert "--landmarks is missing" in told(*ours, "--mesh", mesh)
-    assert "name one of them" in told(*ours, "--mesh", mesh, "--landmarks", marks, "--person", "3")
-    assert "of which mesh?" in told(*ours, "--landmarks", marks)
+    assert "--person 3 cannot be combined with --mesh" in told(
+        *ours, "--mesh", mesh, "--landmarks", marks, "--person", "3"
+    )
+    assert "requires --mesh: the mesh that they belong to" in told(*ours, "--landmarks", marks)
     assert "no such file" in told(*ours, "--mesh", tmp_path / "no.obj", "--landmarks", marks)
     assert "kernel: expected one of" in told(*ours, "--kernel", "cubic")
     assert "intensity" in told(*ours, "--intensity", "3")
     assert "no such file" in told("--livelink", tmp_path / "no.csv")
-    assert "--begin goes with --livelink, not with --end" in told("--end", "anger", "--begin", "3")
-    assert "has nothing at 50 s" in told("--livelink", recorded(tmp_path / "t.csv"), "--begin", "50")
+    assert "--begin requires --livelink, got --end" in told("--end", "anger", "--begin", "3")
+    assert "no frames at 50 s; the recording ends at" in told(
+        "--livelink", recorded(tmp_path / "t.csv"), "--begin", "50"
+    )
     io.landmarks.write(tmp_path / "few.json", points=0.05 * np.eye(3))
-    assert "no scheme of 3 landmarks" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "few.json")
+    assert "unsupported number of landmarks: 3" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "few.json")
     text = marks.read_text().replace("[", "[[9, 9, 9], [", 1).replace("[[[", "[[")
     (tmp_path / "far.json").write_text(text)
     assert "far.json" in told(*ours, "--mesh", mesh, "--landmarks", tmp_path / "far.json")
@@ -343,12 +347,12 @@ def test_a_corpus_is_written_and_read(capsys, tmp_path):
     ("arguments", "message"),
     [
         (("--count", 0), "count: expected 1 to"),
-        (("--count", 3, "--samples", 2), "--samples does not go with --count"),
-        (("--count", 3, "--frames", "natural"), "natural does not go with --count"),
+        (("--count", 3, "--samples", 2), "--samples cannot be combined with --count"),
+        (("--count", 3, "--frames", "natural"), "natural cannot be combined with --count"),
         (("--count", 3, "--start", "anger"), "--end is missing"),
         (("--count", 3, "--people", 5000), "--people must lie in 0..1000"),
-        (("--count", 3, "--people", 2, "--face", "x.ply"), "name one of them"),
-        (("--end", "anger", "--people", 2), "--people goes with --count"),
+        (("--count", 3, "--people", 2, "--face", "x.ply"), "--people 2 cannot be combined with --face x.ply"),
+        (("--end", "anger", "--people", 2), "--people requires --count"),
         ((), "--end is missing"),
     ],
 )

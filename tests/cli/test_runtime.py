@@ -51,7 +51,7 @@ print(told, faults() - before)
         ({"ADDRESS": "localhost:1", "NUM": "two", "ID": "0"}, "the last two whole numbers"),
         ({"ADDRESS": "nonsense", "NUM": "2", "ID": "0"}, "expected host:port, got nonsense"),
         ({"ADDRESS": "localhost:99999999", "NUM": "2", "ID": "0"}, "expected host:port"),
-        ({"ADDRESS": "nowhere.invalid:9000", "NUM": "2", "ID": "1"}, "nowhere.invalid is no known host"),
+        ({"ADDRESS": "nowhere.invalid:9000", "NUM": "2", "ID": "1"}, "nowhere.invalid is an unknown host"),
     ],
 )
 def test_a_job_that_cannot_be_joined_is_refused_at_once(told, message, monkeypatch):

@@ -40,7 +40,7 @@ def split_of(data, at):
 
 
 def test_all_splits_are_all_meshes(ball_store):
-    np.testing.assert_array_equal(of_split(ball_store, *SPLITS).at, np.arange(len(ball_store.vertices)))
+    np.testing.assert_array_equal(of_split(ball_store, *SPLITS).indices, np.arange(len(ball_store.vertices)))
     assert sum(of_split(ball_store, split).count for split in SPLITS) == len(ball_store.vertices)
 
 
@@ -65,7 +65,7 @@ def test_rows_and_every_so_manieth(ball_store):
     for found, expected in zip(train.rows(at).read(np.array([2, 0])), train.read(np.array([11, 3])), strict=True):
         np.testing.assert_array_equal(found, expected)
     for step in (1, 3, 1000):
-        np.testing.assert_array_equal(train.thin(step).at, train.indices[::step])
+        np.testing.assert_array_equal(train.thin(step).indices, train.indices[::step])
         np.testing.assert_array_equal(train.thin(step).owner, train.owner[::step])
     assert train.rows(at).thin(2).count == 2 and train.size == train.thin(2).size
 

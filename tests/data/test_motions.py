@@ -117,7 +117,10 @@ def test_a_recording_that_stands_still_has_finite_halves(data):
 
 
 def test_names_choose_and_number_the_labels(data):
-    found, whole = motions.halves(data, "train", frames=6, label_names=("neutral", "c", "a")), motions.halves(data, "train")
+    found, whole = (
+        motions.halves(data, "train", frames=6, label_names=("neutral", "c", "a")),
+        motions.halves(data, "train"),
+    )
     assert found.curves.shape == (3 * 2 * 2, 6, 4, 3)
     wanted = [{1: 2, 3: 1}[x] for x in whole.end.tolist() if x in (1, 3)]
     assert found.end[found.end > 0].tolist() == wanted
@@ -162,13 +165,13 @@ def test_both_choices_are_those_of_the_selection(onsets):
     labels, peaks = onsets.end - 1, onsets.curves[:, -1]
     prototypes = augment.prototypes(peaks, labels, classes=3)
     nearest = augment.select(peaks, labels, prototypes, per_pair=2, reuse=1).pairs
-    evenly = augment.spread(labels, classes=3, per_pair=2, seed=5)
+    evenly = augment.balanced_pairs(labels, classes=3, per_pair=2, seed=5)
     for wanted, options in ((nearest, {"reuse": 1}), (evenly, {"choice": "spread", "seed": 5})):
         np.testing.assert_array_equal(np.stack(rows_of(onsets, between(onsets, per_pair=2, **options)), 1), wanted)
 
 
-def test_pace_changes_the_way_and_not_the_ends(onsets):
-    even, performed = (between(onsets, per_pair=1, pace=pace) for pace in ("even", "performed"))
+def test_time_warp_changes_the_way_and_not_the_ends(onsets):
+    even, performed = (between(onsets, per_pair=1, time_warp=time_warp) for time_warp in ("even", "performed"))
     np.testing.assert_allclose(performed.curves[:, [0, -1]], even.curves[:, [0, -1]], atol=1e-5)
     # The onset is slow: what is performed moves less at first.
     first = [pace_of(found.curves)[:, 0] for found in (performed, even)]
@@ -194,7 +197,7 @@ def test_only_what_is_wanted_and_in_parts_of_any_size(onsets):
         (lambda data, onsets: motions.direct_transitions(data, "train"), "no such motions in this split"),
         (lambda data, onsets: motions.halves(data, "all"), "unknown split 'all'"),
         (lambda data, onsets: between(onsets, per_pair=1, choice="all"), 'choice: expected "prototypes" or "spread"'),
-        (lambda data, onsets: between(onsets, per_pair=1, pace="slow"), "pace: expected one of"),
+        (lambda data, onsets: between(onsets, per_pair=1, time_warp="slow"), "time_warp: expected one of"),
         (lambda data, onsets: between(onsets, per_pair=0, choice="spread"), "per_pair: expected at least 1, got 0"),
         (lambda data, onsets: between(onsets, per_pair=0), "per_pair, reuse: expected at least 1, got 0"),
         (lambda data, onsets: motions.interpolated_transitions(onsets, 5, per_pair=1), "every class at least once"),

@@ -45,7 +45,7 @@ def test_pairs_within_a_group_are_of_other_recordings():
     recording = np.arange(80) // 10
     both, _ = noise_floor.nearest_pairs(landmarks, group, recording=recording, within_groups=True)
     assert (group[both[:, 0]] == group[both[:, 1]]).all() and (recording[both[:, 0]] != recording[both[:, 1]]).all()
-    with pytest.raises(ValueError, match="need `apart`"):
+    with pytest.raises(ValueError, match="needs `recording`"):
         noise_floor.nearest_pairs(landmarks, group, within_groups=True)
-    with pytest.raises(ValueError, match="no two frames to compare"):
+    with pytest.raises(ValueError, match="no pairs: expected two groups"):
         noise_floor.nearest_pairs(landmarks, np.zeros(80))

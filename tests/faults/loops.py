@@ -32,7 +32,7 @@ def gan(folder, mesh):
     _, chart, examples = motions()
     plan = fit_motion.GanPlan(steps=STEPS, batch=4, critic_steps=2)
     config = motion3dgan.Config(width=16, blocks=1, noise=4, embedding=4)
-    return fit_motion.fit_gan(examples, chart, folder, plan=plan, config=config, mesh=mesh)
+    return fit_motion.fit_gan(examples, chart, folder, plan=plan, config=config, device_mesh=mesh)
 
 
 def flow(folder, mesh):
@@ -42,7 +42,7 @@ def flow(folder, mesh):
     _, chart, examples = motions()
     plan = fit_motion.FlowPlan(steps=STEPS, batch=8)
     return fit_motion.fit_flow(
-        examples, chart, folder, plan=plan, config=flow_matching.Config(width=16, blocks=1, embedding=4), mesh=mesh
+        examples, chart, folder, plan=plan, config=flow_matching.Config(width=16, blocks=1, embedding=4), device_mesh=mesh
     )
 
 
@@ -53,7 +53,7 @@ def reference(folder, mesh):
     known, chart, _ = motions()
     plan = fit_motion.REFERENCE._replace(steps=STEPS, batch=2, critic_steps=2)
     config = motion3dgan_reference.Config(width_divisor=16, noise=4)
-    return fit_motion.fit_reference(known, chart, folder, plan=plan, config=config, mesh=mesh)
+    return fit_motion.fit_reference(known, chart, folder, plan=plan, config=config, device_mesh=mesh)
 
 
 def balls():
@@ -71,7 +71,7 @@ def decoder(folder, mesh):
     from facejax.training.recipes import fit_s2d_dec
 
     _, train, hierarchy = balls()
-    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=STEPS, batch=8), mesh=mesh)
+    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=STEPS, batch=8), device_mesh=mesh)
 
 
 def residual(folder, mesh):
@@ -79,7 +79,7 @@ def residual(folder, mesh):
 
     _, train, hierarchy = balls()
     base, plan = fit_gpmm.fit(train, components=20), fit_residual.ResidualPlan(steps=STEPS, batch=8)
-    return fit_residual.fit(train, hierarchy, folder, plan=plan, base=base, mesh=mesh).network
+    return fit_residual.fit(train, hierarchy, folder, plan=plan, base=base, device_mesh=mesh).network
 
 
 def neural3dmm(folder, mesh):
@@ -87,7 +87,7 @@ def neural3dmm(folder, mesh):
 
     _, train, hierarchy = balls()
     plan = fit_neural3dmm.Neural3DMMPlan(steps=STEPS, batch=8)
-    return fit_neural3dmm.fit(train, hierarchy, folder, plan=plan, mesh=mesh).params
+    return fit_neural3dmm.fit(train, hierarchy, folder, plan=plan, device_mesh=mesh).params
 
 
 def expressions(folder, mesh):

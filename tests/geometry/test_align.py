@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from facejax.geometry import align, srvf
+from facejax.geometry import align, host, srvf
 
 GRADIENT = {"order": 1, "modes": ("fwd", "rev"), "eps": 1e-6, "atol": 1e-6, "rtol": 1e-6}
 
@@ -192,3 +192,22 @@ def test_interpolate_gradients(x64):
 def test_wrong_input_is_named(call, match):
     with pytest.raises(ValueError, match=match):
         call(jnp.ones((6, 4, 3)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_host_form_is_the_rigid_fit_of_procrustes(x64, seed):
+    source = 5 * random(seed, 9, 3) + 20
+    turn = Rotation.random(rng=seed).as_matrix()
+    target = source @ turn.T + [3, -1, 2] + 0.1 * random(seed + 10, 9, 3)
+    rotation, source_centroid, target_centroid = host.procrustes(source, target)
+    expected = align.procrustes(source, target)
+    np.testing.assert_allclose(rotation, expected.rotation, atol=1e-12)
+    moved = (source - source_centroid) @ rotation.T + target_centroid
+    np.testing.assert_allclose(moved, align.apply(expected, source), atol=1e-11)
+
+
+def test_the_host_form_never_reflects():
+    source = random(7, 9, 3)
+    rotation, _, _ = host.procrustes(source, source * [-1, 1, 1])
+    np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)

@@ -242,7 +242,7 @@ def test_refit_names_the_frame_where_landmarks_meet(head):
     rest, vertices = head
     d = np.zeros((4, 68, 3))
     d[2, 66] = rest[62] - rest[66]
-    with pytest.raises(ValueError, match="frame 3: landmarks 62 and 66 are in one place"):
+    with pytest.raises(ValueError, match="frame 3: landmarks 62 and 66 coincide"):
         rbf.refit(rest, d, vertices)
     with pytest.raises(ValueError, match=r"displacements: expected \(T, 68, 3\), got \(4, 67, 3\)"):
         rbf.refit(rest, d[:, 1:], vertices)
@@ -260,19 +260,19 @@ FLAT = scattered(19) * [1, 1, 0]
 @pytest.mark.parametrize(
     ("call", "match"),
     [
-        (lambda: rbf.fit(scattered(0)[:3]), "needs 4 that are not in one plane, got 3"),
+        (lambda: rbf.fit(scattered(0)[:3]), "needs 4 that are not coplanar, got 3"),
         (lambda: rbf.fit(scattered(0)[:1], kernel="gaussian", affine=False), "at least 2, got 1"),
         (lambda: rbf.fit(scattered(0)[:, :2]), r"landmarks: expected \(K, 3\), got shape \(12, 2\)"),
-        (lambda: rbf.fit(with_row(5, np.nan)), "landmarks: number 5 is not finite"),
-        (lambda: rbf.fit(with_row(9, scattered(18)[4])), "landmarks 4 and 9 are in one place"),
-        (lambda: rbf.fit(FLAT), "all in one plane.*affine=False"),
+        (lambda: rbf.fit(with_row(5, np.nan)), "landmarks: row 5 is not finite"),
+        (lambda: rbf.fit(with_row(9, scattered(18)[4])), "landmarks 4 and 9 coincide"),
+        (lambda: rbf.fit(FLAT), "coplanar.*affine=False"),
         (lambda: rbf.fit(scattered(0), kernel="cubic"), "expected one of gaussian, .*, got 'cubic'"),
         (lambda: rbf.fit(scattered(0), sigma=0), "sigma: expected a positive number of landmark spacings, got 0"),
         (lambda: rbf.fit(scattered(0), sigma=np.inf), "sigma: expected a positive"),
         (lambda: rbf.fit(scattered(0), smoothing=-1), "smoothing: expected 0 or more, got -1"),
         (lambda: rbf.fit(scattered(0), kernel="triharmonic", affine=False), "triharmonic needs its affine term"),
         (lambda: rbf.fit(scattered(0), kernel="gaussian", sigma=1e3), "gaussian of width 1000 is too wide"),
-        (lambda: rbf.weights(rbf.fit(scattered(0)), with_row(3, np.inf)), "vertices: number 3 is not finite"),
+        (lambda: rbf.weights(rbf.fit(scattered(0)), with_row(3, np.inf)), "vertices: row 3 is not finite"),
         (lambda: rbf.weights(rbf.fit(scattered(0)), np.zeros((0, 3))), r"vertices: expected \(K, 3\)"),
         (lambda: rbf.warp(jnp.ones((5, 4)), jnp.ones((3, 3))), r"got \(5, 4\) and \(3, 3\)"),
         (lambda: rbf.warp(jnp.ones((5, 4)), jnp.ones((4, 2))), r"displacements \(\.\.\., L, 3\)"),

@@ -83,7 +83,7 @@ def test_roots(dtype):
     squared[:100] = 0
     squared = np.asarray(squared, dtype)
     squared[squared < np.finfo(dtype).tiny] = 0  # as XLA has it
-    np.testing.assert_allclose(finite(sphere.root, jnp.asarray(squared)), np.sqrt(squared), rtol=1e-6)
+    np.testing.assert_allclose(finite(sphere.safe_sqrt, jnp.asarray(squared)), np.sqrt(squared), rtol=1e-6)
 
 
 def test_means(dtype):
@@ -167,7 +167,7 @@ def test_transitions(dtype):
 def test_halves(dtype):
     curve = curves(dtype)
     peak = augment.apex(curve)
-    found = finite(lambda curve: augment.halves(curve, peak, frames=3), curve)
+    found = finite(lambda curve: augment.split_at_peak(curve, peak, frames=3), curve)
     highest = np.asarray(curve)[np.arange(COUNT), np.asarray(peak)]
     np.testing.assert_array_equal(found[0][:, 0], curve[:, 0])
     np.testing.assert_array_equal(found[0][:, -1], highest)

@@ -43,7 +43,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         expressions.load(tmp_path / "none.safetensors")
     networks = made()
     expressions.save(tmp_path / "n.safetensors", networks._replace(config=networks.config._replace(hidden=9)))
-    with pytest.raises(weights.WeightsError, match="does not fit"):
+    with pytest.raises(weights.WeightsError, match="does not match the model"):
         expressions.load(tmp_path / "n.safetensors")
 
 

@@ -112,7 +112,7 @@ def test_register_on_the_command_line(files, tmp_path, capsys, head):
     scan, marks, points = files
     code, printed, err = run(capsys, "register", scan, "--landmarks", marks, "--out", tmp_path / "o")
     assert code == 0, err
-    assert "read as metres" in err and "7 of 68 landmarks are given" in err and "mm from the scan in the mean" in err
+    assert "read as metres" in err and "7 of 68 landmarks are given" in err and "mean distance to the scan" in err
     names = ["scan-template.ply", "scan-landmarks.json", "scan-fit.json", "scan-fit.png"]
     assert printed.splitlines() == [str(tmp_path / "o" / name) for name in names]
     record = json.loads((tmp_path / "o" / "scan-fit.json").read_text())
@@ -162,7 +162,9 @@ def test_bad_scans_get_one_line(files, tmp_path, capsys, head):
         "register", scan, "--landmarks", tmp_path / "mirrored.json"
     )
     io.landmarks.write(tmp_path / "five.json", points=points[:5])
-    assert "no scheme of 5 landmarks is known" in told("register", scan, "--landmarks", tmp_path / "five.json")
+    assert "unsupported number of landmarks: 5 (supported: 51, 66, 68, 83)" in told(
+        "register", scan, "--landmarks", tmp_path / "five.json"
+    )
     names = ["nose tip", "right lip corner", "chin", "left lip corner", "somewhere"]
     io.landmarks.write(tmp_path / "named.json", points=points[[4, 5, 0, 6, 1]], names=names)
     with pytest.raises(MeshError, match="do not form a face"):  # the corner of an eye is no chin

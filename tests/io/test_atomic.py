@@ -2,7 +2,7 @@
 
 import pytest
 
-from facejax.io import atomic
+from facejax.io import atomic, errors
 
 
 def test_replacing_leaves_nothing_behind(tmp_path):
@@ -29,7 +29,7 @@ def test_replacing_folder_replaces_or_vanishes(tmp_path):
 
 
 def test_what_is_said_of_a_file_is_one_short_printable_line():
-    said = str(atomic.FileError("/a b.ply: names\n\x1b[31mred\u202e\tand " + 9_000_000 * "x" + ": leave it out"))
+    said = str(errors.FileError("/a b.ply: names\n\x1b[31mred\u202e\tand " + 9_000_000 * "x" + ": leave it out"))
     assert said.startswith("/a b.ply: names [31mred and xxx") and said.endswith("xxx: leave it out")
-    assert said.isprintable() and len(said) <= atomic.MAX_MESSAGE_CHARS + 5
-    assert atomic.one_line(ValueError("ä short one")) == "ä short one"
+    assert said.isprintable() and len(said) <= errors.MAX_MESSAGE_CHARS + 5
+    assert errors.one_line(ValueError("ä short one")) == "ä short one"

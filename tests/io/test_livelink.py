@@ -1,4 +1,4 @@
-"""Recordings of Live Link Face: timecodes, gaps, rest, sides; garbled files are refused by line and column."""
+"""Recordings of Live Link Face: timecodes, gaps, sides; invalid files are rejected with line and column."""
 
 from pathlib import Path
 
@@ -7,7 +7,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from facejax.data.synthetic import makehuman, rig
 from facejax.io import livelink
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "livelink" / "alex_rom_3.csv"
@@ -119,7 +118,7 @@ def test_midnight_gaps_duplicates_and_disorder(path):
     np.testing.assert_allclose(found.times, ramp, atol=1e-4)
     np.testing.assert_allclose(_column(found, "jawOpen"), ramp / 3, atol=1e-6)
     np.testing.assert_allclose(found.gaps, [(29 / 30, 4 / 30), (59 / 30, 16 / 30)], atol=1e-4)
-    assert "left out 2 rows of a time that was there before" in found.notes
+    assert "dropped 2 rows with duplicate times" in found.notes
 
 
 def test_rows_without_a_face_become_a_gap(path):
@@ -131,76 +130,7 @@ def test_rows_without_a_face_become_a_gap(path):
     found = livelink.read(path)
     assert len(found.times) == 80 and len(found.gaps) == 1
     assert found.gaps[0][1] == pytest.approx(11 / 30, abs=1e-4)
-    assert "left out 10 rows without a face" in found.notes
-
-
-def test_resampling_is_linear_and_holds_still_over_long_gaps():
-    times = np.array([0, 0.1, 0.3, 1.3, 1.4])
-    weights = np.zeros((5, 52), np.float32)
-    weights[:, 0] = times
-    gaps = ((0.1, 0.2), (0.3, 1.0))
-    recording = livelink.Recording(weights, np.tile(weights[:, :1], 3), times, gaps)
-    found = livelink.resample(recording, rate=20, bridge=0.5)
-    np.testing.assert_allclose(found.times, np.arange(29) / 20)
-    expected = np.where((found.times > 0.3) & (found.times < 1.3), 0.3, found.times)
-    np.testing.assert_allclose(found.weights[:, 0], expected, atol=1e-6)
-    np.testing.assert_allclose(found.head[:, 2], expected, atol=1e-6)
-    assert found.gaps == ((0.3, 1.0),) and "held still over 1 gaps longer than 0.5 s" in found.notes
-    bridged = livelink.resample(recording, rate=20, bridge=2)
-    np.testing.assert_allclose(bridged.weights[:, 0], bridged.times, atol=1e-6)
-    assert bridged.gaps == () and bridged.notes == ()
-
-
-def test_resampling_refuses_nonsense_and_takes_a_single_row():
-    one = livelink.Recording(np.ones((1, 52), np.float32), np.ones((1, 3), np.float32), np.zeros(1))
-    np.testing.assert_array_equal(livelink.resample(one).weights, one.weights)
-    assert livelink.rest_weights(one).shape == (52,)
-    for rate in (0, -1, np.nan, np.inf):
-        with pytest.raises(ValueError, match="rate must be positive"):
-            livelink.resample(one, rate=rate)
-    with pytest.raises(ValueError, match="more than 1000000 frames"):
-        livelink.resample(one._replace(times=np.array([86_400.0])), rate=60)
-
-
-def test_rest_is_the_pose_that_the_face_comes_back_to():
-    rng = np.random.default_rng(1)
-    quiet = rng.uniform(0, 0.3, 52)
-    poses = np.clip(rng.normal(0, 0.5, (12, 52)), 0, 1)
-    weights = np.repeat(quiet[None], 1200, axis=0)
-    for i, pose in enumerate(poses):  # rests for 40 frames, then 60 frames of an expression
-        bump = np.sin(np.linspace(0, np.pi, 60))[:, None]
-        weights[100 * i + 40 : 100 * i + 100] += bump * (pose - quiet)
-    weights += rng.normal(0, 0.005, weights.shape)
-    recording = livelink.Recording(weights.astype(np.float32), np.zeros((1200, 3)), np.arange(1200) / 30)
-    found = livelink.rest_weights(recording)
-    np.testing.assert_allclose(found, quiet, atol=0.01)
-    above = livelink.subtract_rest(recording)
-    assert above.weights.min() >= 0 and np.abs(above.weights[:40]).max() < 0.05
-    np.testing.assert_array_equal(above.weights, livelink.subtract_rest(recording, found).weights)
-
-
-def test_above_rest_keeps_what_is_full():
-    recording = livelink.Recording(np.ones((2, 52), np.float32), np.zeros((2, 3)), np.arange(2.0))
-    np.testing.assert_allclose(livelink.subtract_rest(recording, np.full(52, 0.4)).weights, 1, rtol=1e-6)
-    np.testing.assert_allclose(livelink.subtract_rest(recording, np.ones(52)).weights, 0)
-    with pytest.raises(ValueError, match=r"resting must be \(52,\), got \(3,\)"):
-        livelink.subtract_rest(recording, np.zeros(3))
-
-
-def test_unit_weights_drive_the_rig(path):
-    _csv(path, TIMES[:3], EyeBlinkRight=[0, 0.5, 1], JawOpen=[0, 0, 0.7], TongueOut=1.0)
-    weights = livelink.unit_weights(livelink.read(path), rig.unit_names())
-    names = rig.unit_names()
-    assert weights.shape == (3, len(names)) and weights.dtype == np.float32
-    np.testing.assert_allclose(weights[:, names.index("eyeBlinkRight")], [0, 0.5, 1])
-    assert np.count_nonzero(weights.any(axis=0)) == 2
-    assert set(livelink.BLENDSHAPES) - set(names) == {"tongueOut"}
-    subject = makehuman.subject(100)
-    posed = rig.pose(rig.build(subject, level=1), weights)
-    moved = np.linalg.norm(posed - posed[0], axis=-1)
-    np.testing.assert_allclose(posed[0], subject.neutral, atol=2e-5)
-    # The subject's right is at x < 0.
-    assert np.all(subject.neutral[moved[1] > 1, 0] < 0)
+    assert "dropped 10 rows without a face" in found.notes
 
 
 def _row(line):
@@ -220,9 +150,12 @@ def _swap(at, word):
 
 BAD = {
     "empty": (lambda lines: [], "0 bytes"),
-    "blank": (lambda lines: [" "], r"line 1: lacks the columns timecode, eyeBlinkLeft, eyeLookDownLeft and 53 more"),
-    "column": (lambda lines: [lines[0].replace("JawOpen", "Jaw"), *lines[1:]], "line 1: lacks the columns jawOpen; is"),
-    "no rows": (lambda lines: lines[:1], "holds no row with a face"),
+    "blank": (lambda lines: [" "], r"line 1: missing columns timecode, eyeBlinkLeft, eyeLookDownLeft and 53 more"),
+    "column": (
+        lambda lines: [lines[0].replace("JawOpen", "Jaw"), *lines[1:]],
+        "line 1: missing columns jawOpen; expected",
+    ),
+    "no rows": (lambda lines: lines[:1], "contains no row with a face"),
     "short": (_row("12:00:00:10.000,61,0.5"), "line 4: expected 63 columns as in line 1, got 3"),
     "long": (_row(lambda words: [*words, "1"]), "line 4: expected 63 columns as in line 1, got 64"),
     "word": (_swap(2, "shut"), r"line 4, column EyeBlinkLeft: expected a number in -0\.5\.\.2, got 'shut'"),
@@ -232,8 +165,8 @@ BAD = {
     "percent": (_swap(2, "85.0"), "line 4, column EyeBlinkLeft: .* got '85.0'"),
     "degrees": (_swap(55, "12.5"), r"line 4, column HeadPitch: expected a number in -6\.28\.\.6\.28, got '12\.5'"),
     "clock": (_swap(0, "1.25"), "line 4, column Timecode: expected HH:MM:SS:FF.fff, got '1.25'"),
-    "hour": (_swap(0, "24:00:00:00.000"), "line 4, column Timecode: no time of day: '24:00:00:00.000'"),
-    "frame": (_swap(0, "13:03:20:60.000"), "line 4, column Timecode: frame 60 of 60 per second"),
+    "hour": (_swap(0, "24:00:00:00.000"), "line 4, column Timecode: invalid time of day '24:00:00:00.000'"),
+    "frame": (_swap(0, "13:03:20:60.000"), "line 4, column Timecode: frame 60, expected below 60"),
 }
 
 
@@ -253,7 +186,7 @@ def test_missing_large_and_foreign_files(path, tmp_path, monkeypatch):
     with pytest.raises(livelink.RecordingError, match=r"expected a file of|cannot be read"):
         livelink.read(tmp_path)
     path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(livelink.RecordingError, match="not a text in UTF-8"):
+    with pytest.raises(livelink.RecordingError, match="not UTF-8 text"):
         livelink.read(path)
     _csv(path, TIMES[:6])
     monkeypatch.setattr(livelink, "MAX_ROWS", 5)
@@ -277,23 +210,3 @@ def test_no_damage_escapes_as_another_error(tmp_path, at, new, drop):
         assert "bad.csv" in str(error)
     else:
         assert np.isfinite(found.weights).all() and np.all(np.diff(found.times) > 0)
-
-
-def test_a_real_recording():
-    if not REAL.exists():
-        pytest.skip("the recording alex_rom_3.csv is not beside this checkout")
-    found = livelink.read(REAL)
-    assert found.weights.shape == (4030, 52) and found.times[-1] == pytest.approx(134.38, abs=0.01)
-    np.testing.assert_allclose([gap[0] for gap in found.gaps], [19.83, 70.82, 120.65], atol=0.01)
-    np.testing.assert_allclose([gap[1] for gap in found.gaps], 4 / 60, atol=1e-4)
-    resting = livelink.rest_weights(found)
-    near = np.linalg.norm(found.weights - resting, axis=1) < 0.25
-    assert near.mean() > 0.1 and np.ptp(found.times[near]) > 120
-    above = livelink.resample(livelink.subtract_rest(found))
-    assert len(above.times) == 4032 and above.gaps == ()
-    # Eyes close fully, and the sides agree: the mouth goes where the eye narrows and the corner is stretched.
-    assert _column(above, "eyeBlinkLeft").max() > 0.95
-    aside = _column(above, "mouthLeft") - _column(above, "mouthRight")
-    for part in ("eyeBlink", "cheekSquint", "mouthStretch", "mouthUpperUp"):
-        lean = _column(above, f"{part}Left") - _column(above, f"{part}Right")
-        assert lean[aside < -0.3].mean() < min(0, lean[aside > 0.2].mean()), part

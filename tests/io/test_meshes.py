@@ -138,7 +138,7 @@ BAD = {
         (HEAD.format(n=3) + "end_header\n0 0 0\n0 0").encode(),
         "ends early: vertex needs 9 numbers, 5",
     ),
-    "none.ply": ((HEAD.format(n=0) + "end_header\n").encode(), "holds no vertices"),
+    "none.ply": ((HEAD.format(n=0) + "end_header\n").encode(), "contains no vertices"),
     "nan.ply": (
         (HEAD.format(n=2) + "end_header\n0 0 0\n0 nan 1\n").encode(),
         r"vertex 1 is not finite: \[0.0, nan",
@@ -151,7 +151,7 @@ BAD = {
         (HEAD.format(n=3) + FACE + "end_header\n0 0 0\n1 0 0\n0 1 0\n2 0 1\n").encode(),
         "2 corners",
     ),
-    "word.ply": ((HEAD.format(n=1) + "end_header\n0 0 zero\n").encode(), "a word that is no number"),
+    "word.ply": ((HEAD.format(n=1) + "end_header\n0 0 zero\n").encode(), "not a number"),
     "kind.ply": (
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quad x\nend_header\n",
         "property quad x",
@@ -165,13 +165,13 @@ BAD = {
         (HEAD.format(n=1) + FACE + "end_header\n0 0 0\n99999999 0 0 0\n").encode(),
         "has length 1e\\+08",
     ),
-    "word.obj": (b"v 0 0 zero\n", "line 1: cannot be understood"),
+    "word.obj": (b"v 0 0 zero\n", "line 1: cannot be parsed"),
     "short.obj": (b"v 0 0\n", "line 1"),
     "zero.obj": (b"v 0 0 0\nf 0 1 1\n", "line 2"),
     "far.obj": (b"v 0 0 0\nf 1 1 2\n", "triangle 0"),
     "back.obj": (b"v 0 0 0\nf -1 -1 -2\n", "triangle 0"),
     "inf.obj": (b"v 0 0 0\nv inf 0 0\n", "vertex 1 is not finite"),
-    "none.obj": (b"# nothing\n", "holds no vertices"),
+    "none.obj": (b"# nothing\n", "contains no vertices"),
     "noise.npz": (b"PK\x03\x04", "noise.npz"),
     "noise.npy": (b"\x93NUMPY\x09\x00", "noise.npy"),
     "noise.glb": (b"glTF\x02", "not a GLB"),
@@ -201,8 +201,8 @@ def test_missing_and_unreadable(tmp_path):
     [
         ({"points": np.zeros((2, 3))}, "no array 'vertices'"),
         ({"vertices": np.zeros((2, 2))}, r"must be \(N, 3\), got \(2, 2\)"),
-        ({"vertices": np.zeros((0, 3))}, "holds no vertices"),
-        ({"vertices": np.array([[{}, 1, 2]], dtype=object)}, "must hold numbers"),
+        ({"vertices": np.zeros((0, 3))}, "contains no vertices"),
+        ({"vertices": np.array([[{}, 1, 2]], dtype=object)}, "expected numbers, got object"),
         ({"vertices": np.zeros((2, 3)), "faces": np.zeros((1, 3))}, r"faces must be \(F, 3\) integers"),
     ],
 )
@@ -217,7 +217,7 @@ def test_an_array_header_that_claims_too_much(tmp_path):
         header = {"descr": "<f8", "fortran_order": False, "shape": (2 * 10**11, 3)}
         np.lib.format.write_array_header_1_0(stream, header)
         stream.write(bytes(48))
-    with pytest.raises(meshes.MeshError, match="needs 4800000000000 bytes, the file holds 48"):
+    with pytest.raises(meshes.MeshError, match="needs 4800000000000 bytes, the file contains 48"):
         meshes.read(tmp_path / "mesh.npy")
 
 

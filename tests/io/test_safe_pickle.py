@@ -75,7 +75,7 @@ class Runs:
 def test_what_is_no_data_is_refused_before_it_runs(tmp_path, thing, name, protocol):
     path, mark = tmp_path / "data.pkl", tmp_path / "ran"
     path.write_bytes(pickle.dumps({"a": thing(mark)}, protocol=protocol))
-    with pytest.raises(safe_pickle.PickleError, match=rf"data.pkl: names {name}.*, which is not let through"):
+    with pytest.raises(safe_pickle.PickleError, match=rf"data.pkl: contains {name}.*, which is not allowed"):
         safe_pickle.read(path)
     assert not mark.exists()
 
@@ -88,7 +88,7 @@ def test_arrays_that_claim_more_than_they_hold(tmp_path):
     with pytest.raises(safe_pickle.PickleError, match="begins an array with"):
         safe_pickle.read(path)
     path.write_bytes(whole.replace(b"K\x03\x85", b"J\xff\xff\xff\x7f\x85", 1))
-    with pytest.raises(safe_pickle.PickleError, match="is damaged"):
+    with pytest.raises(safe_pickle.PickleError, match="damaged: "):
         safe_pickle.read(path)
 
 

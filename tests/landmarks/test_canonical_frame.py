@@ -80,5 +80,5 @@ def test_the_unit_of_a_mesh_without_known_landmarks_is_told_by_its_size(size, un
     """Heads, and faces cut out of them: no size fits two units."""
     millimetres, found = canonical_frame.infer_head_unit(size, "it")
     assert found == unit and millimetres == canonical_frame.UNITS[unit]
-    with pytest.raises(canonical_frame.FaceError, match="it: 41 in size; expected a head of 100 to 400 mm"):
+    with pytest.raises(canonical_frame.FaceError, match="it: size 41; expected a head of 100 to 400 mm"):
         canonical_frame.infer_head_unit(41.0, "it")

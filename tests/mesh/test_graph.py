@@ -71,7 +71,7 @@ def test_predecessors_lead_to_the_source_and_other_components_are_unreachable():
         (SQUARE, FAN.astype(float), r"integers \(F, 3\)"),
         (SQUARE, FAN + 1, r"corners in 0\.\.4"),
         (SQUARE, FAN[:0], "no face"),
-        (np.vstack([SQUARE, SQUARE]), FAN, "5 loose, first 5"),
+        (np.vstack([SQUARE, SQUARE]), FAN, "5 unused vertices, first 5"),
     ],
 )
 def test_broken_meshes_are_named(vertices, faces, message):

@@ -103,7 +103,7 @@ def test_wrong_tables_are_named(hierarchy):
         mesh_hierarchy.load({})
     with pytest.raises(ValueError, match="level 0: expected tables for 642"):
         mesh_hierarchy.load(arrays | {"corners/0": arrays["corners/0"][1:]})
-    with pytest.raises(ValueError, match="level 1: a table points"):
+    with pytest.raises(ValueError, match="level 1: a table has a vertex index out of range"):
         mesh_hierarchy.load(arrays | {"spirals/1": arrays["spirals/1"] + 2})
 
 

@@ -180,5 +180,5 @@ def test_landmarks_in_one_place_are_named_as_the_user_counts_them():
     shape = makehuman.template()
     marks = shape.vertices[shape.landmarks].astype(np.float64)
     marks[63] = marks[61]
-    with pytest.raises(ValueError, match="landmarks 61 and 63 are in one place"):
+    with pytest.raises(ValueError, match="landmarks 61 and 63 coincide"):
         rbf_weights.weights(shape.vertices, shape.faces, marks, lips=rbf_weights.IBUG_LIPS)

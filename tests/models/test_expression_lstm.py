@@ -153,7 +153,7 @@ def test_stop_holds_the_face_still(monkeypatch):
         ({"start": "rest"}, "start: expected one of zero, neutral"),
         ({"components": 0}, "components: expected 1 to 15"),
         ({"components": 16}, "components: expected 1 to 15"),
-        ({"components": 3, "start": "neutral"}, 'needs the start "zero"'),
+        ({"components": 3, "start": "neutral"}, 'requires the start "zero", got "neutral"'),
     ],
 )
 def test_options_out_of_range(options, message):

@@ -232,12 +232,30 @@ def test_components_for_is_the_least_number_that_keeps_the_share():
         (lambda x: morphable.direction(x, np.full(M, np.inf)), "scores: expected finite numbers, got inf"),
         (lambda x: morphable.direction(x, np.full(M, 0.1), unit=True), "scores: expected at least two .* got 0.1 for"),
         (lambda x: morphable.direction(x[0], np.ones(N)), r"examples: expected \(M, N, C\)"),
-        (lambda x: morphable.fit_identity_expression(x, x[:, 1:], identity=1, expression=1), r"got \(40, 12, 3\) and \(40, 11, 3\)"),
-        (lambda x: morphable.fit_identity_expression(x[..., :2], x[..., :2], identity=1, expression=1), r"expected \(P, N, 3\) and"),
-        (lambda x: morphable.fit_identity_expression(x[0], x, identity=1, expression=1), r"neutral: expected \(M, N, C\)"),
-        (lambda x: morphable.fit_identity_expression(x, 0 * x, identity=1, expression=1), "displacements: .* differ, got 40 alike"),
-        (lambda x: morphable.fit_identity_expression(x, x[:4], identity=5, expression=4), "expression: expected 1 to 3 .* got 4"),
-        (lambda x: morphable.fit_identity_expression(x[:4], x, identity=5, expression=4), "identity: expected 1 to 3 .* got 5"),
+        (
+            lambda x: morphable.fit_identity_expression(x, x[:, 1:], identity=1, expression=1),
+            r"got \(40, 12, 3\) and \(40, 11, 3\)",
+        ),
+        (
+            lambda x: morphable.fit_identity_expression(x[..., :2], x[..., :2], identity=1, expression=1),
+            r"expected \(P, N, 3\) and",
+        ),
+        (
+            lambda x: morphable.fit_identity_expression(x[0], x, identity=1, expression=1),
+            r"neutral: expected \(M, N, C\)",
+        ),
+        (
+            lambda x: morphable.fit_identity_expression(x, 0 * x, identity=1, expression=1),
+            "displacements: .* differ, got 40 alike",
+        ),
+        (
+            lambda x: morphable.fit_identity_expression(x, x[:4], identity=5, expression=4),
+            "expression: expected 1 to 3 .* got 4",
+        ),
+        (
+            lambda x: morphable.fit_identity_expression(x[:4], x, identity=5, expression=4),
+            "identity: expected 1 to 3 .* got 5",
+        ),
     ],
 )
 def test_wrong_examples_are_named(call, message):

@@ -93,7 +93,7 @@ def test_missing_and_damaged_checkpoints_are_named(tmp_path):
             checkpoints.restore(only, step=7)
         for file in (tmp_path / "4" / "default").rglob("d/*"):
             file.write_bytes(b"")
-        with pytest.raises(CheckpointError, match=r"4 is damaged .* delete it to go on from an older one"):
+        with pytest.raises(CheckpointError, match=r"4 is damaged .* delete it to resume from an older one"):
             checkpoints.restore(only)
 
 

@@ -404,7 +404,7 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
             np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
             assert b.sharding.is_fully_replicated and len(b.devices()) == jax.device_count()
     if jax.device_count() > 1:
-        with pytest.raises(ValueError, match="a batch of 7 cannot be shared out evenly among 2 devices"):
+        with pytest.raises(ValueError, match="a batch of 7 cannot be split evenly among 2 devices"):
             shared(state, jax.tree.map(lambda leaf: leaf[:, :7], batch), ())
         laid_out = []
 
@@ -415,7 +415,7 @@ def test_a_batch_shared_out_among_devices_gives_the_same_numbers():
         # An axis counted from the end is the same axis.
         jax.jit(sharding.data_parallel(seen, axis=-2))(state, jnp.zeros((3, 8, 4)), ())
         assert laid_out[0].shard_shape((3, 8, 4)) == (3, 8 // jax.device_count(), 4)
-    with pytest.raises(ValueError, match=r"a batch of shape \(\) cannot be shared out"):
+    with pytest.raises(ValueError, match=r"a batch of shape \(\) cannot be split"):
         sharding.data_parallel(step)(state, 0.5, ())
     with pytest.raises(ValueError, match="axis: expected 0 or more, got -1"):
         sharding.split_along(sharding.data_mesh(), -1)

@@ -64,7 +64,7 @@ def test_mp4_without_ffmpeg_names_the_extra(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "frames", "fps", "message"),
     [
-        ("film.avi", _frames(), 30, "unknown film format '.avi'"),
+        ("film.avi", _frames(), 30, "unknown video format '.avi'"),
         ("film.webp", _frames().astype(float), 30, "uint8, got"),
         ("film.webp", _frames()[0], 30, "frames must be"),
         ("film.webp", _frames(), 0, "fps must be positive"),

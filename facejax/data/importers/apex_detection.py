@@ -58,7 +58,7 @@ def not_at_rest(curve: np.ndarray, rest: np.ndarray, phases: Phases) -> tuple[bo
 def count_returns(curve: np.ndarray, rest: np.ndarray) -> int:
     """Count the separate expressions in landmarks (T, L, 3) with those at rest (L, 3).
 
-    An expression is an excursion above half of the largest displacement, separated from the others by frames below 10 %.
+    An expression is an excursion above half of the largest displacement, separated from others by frames below 10 %.
     """
     moved = mean_displacement(curve, rest)
     far, near = moved > 0.5 * moved.max(), moved < 2 * REST_FRACTION * moved.max()

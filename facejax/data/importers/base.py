@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from facejax.io import atomic, meshes
+from facejax.io import errors, meshes
 
 MAX_SIZE_RATIO = 3.0  # between two meshes of a dataset: faces differ by less, units by more
 
 Frame = tuple[str, meshes.Mesh]  # a name for messages, and the mesh
 
 
-class SourceError(atomic.FileError):
+class SourceError(errors.FileError):
     """Recordings cannot be used; the message names the file or folder, what was expected and what was found."""
 
 
@@ -42,7 +42,9 @@ class RecordingInfo(NamedTuple):
     path: Path
     frame_paths: tuple[Path, ...]  # one file per frame; empty where one file holds all frames
     num_frames: int
-    phases: tuple[int, int, int, int] | None = None  # onset, apex start, apex end, offset, where the layout defines them
+    phases: tuple[int, int, int, int] | None = (
+        None  # onset, apex start, apex end, offset, where the layout defines them
+    )
 
 
 class Source(NamedTuple):

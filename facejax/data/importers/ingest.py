@@ -1,9 +1,9 @@
-"""A store of recordings: every frame checked and written once, by all processors; stopped at any moment, it goes on.
+"""Import of recordings into a dataset: every frame is checked and written once, by all processors, and can resume.
 
-Frames are read one at a time. What is done lies in a hidden folder beside the store until all is done. Something wrong
-with the recordings takes it away again; an interruption, a process lost or a full disk leave it, and the same request
-goes on there and comes to the same bytes. One order of vertices, the same triangles, one unit; y up, z forward.
-T frames, N vertices, L landmarks.
+Frames are read one at a time. Unfinished work is kept in a hidden folder beside the dataset. An error in the recordings
+removes it; an interruption, a lost process or a full disk keep it, and the same request then resumes there and gives
+the same bytes. All meshes must share one vertex order, triangles and unit; y up, z forward. T frames, N vertices,
+L landmarks.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy import spatial
 
 from facejax.data import dataset
 from facejax.data.importers import apex_detection, base, worker
@@ -29,253 +29,266 @@ from facejax.landmarks import canonical_frame, schemes
 VERSION = 1
 SEED = 1
 UNITS = {"mm": "millimetres", "cm": "centimetres", "m": "metres"}
-SPREAD_RATIO_RANGE = (0.5, 2.0)  # of it: what a named unit may make of 68 landmarks
-SIZE_RANGE_MM = (40.0, 5000.0)  # mm, of a whole mesh: a face, or all of a person
-MAX_LANDMARK_DISTANCE = 0.05  # of the mesh's size, that a landmark may lie off its surface
-MIN_LANDMARKS = 4  # landmarks: fewer span no space
-MAX_MESHES = 20_000  # meshes that are stored
+SPREAD_RATIO_RANGE = (0.5, 2.0)  # spread of 68 landmarks relative to the template, in a unit that the user names
+SIZE_RANGE_MM = (40.0, 5000.0)  # of a whole mesh: from a face to a whole body
+MAX_LANDMARK_DISTANCE = 0.05  # of a landmark from its vertex, relative to the size of the mesh
+MIN_LANDMARKS = 4  # fewer do not span 3D space
+MAX_MESHES = 20_000  # stored by default
 Progress = Callable[[int, int], None]
 
 
 class Request(NamedTuple):
-    """What is asked for besides the recordings."""
+    """Options of an import besides the recordings."""
 
     landmarks: Path | None
     unit: str | None = None
     max_meshes: int = MAX_MESHES
-    remove_head_motion: bool = False  # take the head's rigid motion out
-    phases: Mapping[int, cuts.Cuts] = {}  # of takes, by number; the others are found
+    remove_head_motion: bool = False
+    phases: Mapping[int, apex_detection.Phases] = {}  # by number of recording; those of the others are detected
 
 
 def prepare(
-    recordings: Source,
+    source: Source,
     out: str | os.PathLike,
     request: Request,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dataset.Dataset:
-    """Read recordings into a new store at `out`, in millimetres; `index["notes"]` says what was assumed and is odd.
+    """Import recordings into a new dataset at `out`, in millimetres; `index["notes"]` lists assumptions and oddities.
 
     Args:
-      recordings: what a layout's `scan` found.
-      request: `landmarks` is a file of 4 or more landmarks of the first subject's neutral mesh, as
-        `facejax.io.landmarks` reads it; positions, and places on triangles, go to the nearest vertices. `unit`: "mm",
-        "cm" or "m"; by default recognised by the size of the face. `most`: how many meshes are stored, drawn by a fixed
-        seed; landmarks are stored of all frames.
-      workers: processes; by default one for each processor where there is much to read.
+      source: as returned by a layout's `scan`.
+      out: the folder of the dataset; it must not exist.
+      request: `landmarks` is a file of 4 or more landmarks of the first subject's neutral mesh, as read by
+        `facejax.io.landmarks`; positions and barycentric landmarks are moved to the nearest vertices. `unit`: "mm",
+        "cm" or "m"; by default inferred from the size of the face. `max_meshes`: number of meshes stored, a sample with
+        a fixed seed; landmarks are stored for all frames.
+      workers: processes; by default one per processor where there are many frames.
       progress: called with (done, total) recordings.
 
     Raises:
-      SourceError: `out` is there already, or something is wrong with the recordings; nothing is left then.
+      SourceError: `out` exists, or the recordings or the request cannot be used; nothing is left at `out`.
     """
     out, progress = Path(out), progress or (lambda done, total: None)
-    check_request(recordings, out, request)
+    check_request(source, out, request)
     if workers is not None and workers < 1:
         raise SourceError(f"workers: expected 1 or more, got {workers}")
-    job, notes = _job(recordings, out, request)
-    part = out.absolute().parent / f".{out.name}.part"
+    job, notes = _job(source, out, request)
     try:
-        _begin(part, job, _key(job, request))
+        _begin(job, _request_hash(job, request))
         worker.import_all(job, workers, progress)
-        _finish(job, notes, part / "store")
-        os.replace(part / "store", out)
+        _finish(job, notes, job.part / "dataset")
+        os.replace(job.part / "dataset", out)
     except SourceError:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(job.part, ignore_errors=True)
         raise
-    shutil.rmtree(part)
+    shutil.rmtree(job.part)
     return dataset.open_dataset(out)
 
 
-def check_request(recordings: Source, out: Path, request: Request) -> None:
-    """Raise `SourceError` for what cannot be met, before an hour of reading."""
+def check_request(source: Source, out: Path, request: Request) -> None:
+    """Raise `SourceError` for a request that cannot be fulfilled, before any frame is read."""
     if request.unit is not None and request.unit not in UNITS:
         raise SourceError(f"unit: expected {', '.join(UNITS)} or None, got {request.unit!r}")
-    if not 0 < recordings.rate <= 1000:
-        raise SourceError(f"rate: expected frames per second above 0, up to 1000, got {recordings.rate}")
-    if request.most < 1:
-        raise SourceError(f"most (--meshes): expected 1 mesh or more, got {request.most}")
-    if recordings.landmarks_only and request.landmarks is not None:
-        raise SourceError(f"{recordings.layout}: has no --landmarks, its frames are landmarks themselves")
-    if request.landmarks is None and recordings.landmarks is None:
-        raise SourceError(f"{recordings.layout}: its meshes need a file of landmarks")
+    if not 0 < source.rate <= 1000:
+        raise SourceError(f"rate: expected frames per second above 0, up to 1000, got {source.rate}")
+    if request.max_meshes < 1:
+        raise SourceError(f"max_meshes (--meshes): expected 1 or more, got {request.max_meshes}")
+    if source.landmarks_only and request.landmarks is not None:
+        raise SourceError(
+            f"--landmarks is not supported by the {source.layout} importer: its frames consist of landmarks"
+        )
+    if request.landmarks is None and source.landmarks is None:
+        raise SourceError(f"--landmarks is required by the {source.layout} importer")
     if os.path.lexists(out):
-        raise SourceError(f"{out}: is there already; remove it, or name another folder")
-    if out.resolve().is_relative_to(recordings.root.resolve()):
-        raise SourceError(f"{out}: lies among the meshes in {recordings.root}; name a folder outside")
+        raise SourceError(f"{out}: already exists; remove it, or name another folder")
+    if out.resolve().is_relative_to(source.root.resolve()):
+        raise SourceError(f"{out}: is inside the source folder {source.root}; name a folder outside")
     above = next(folder for folder in out.absolute().parents if folder.exists())
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise SourceError(f"{out}: cannot be made, {above} is {'not writable' if above.is_dir() else 'not a folder'}")
+        reason = "not writable" if above.is_dir() else "not a folder"
+        raise SourceError(f"{out}: cannot be created, {above} is {reason}")
 
 
-def _job(found: Source, out: Path, request: Request) -> tuple[worker.Job, list[str]]:
-    """All that is known before the recordings are read, and what was assumed."""
-    shared = base.reference_mesh(found)
-    index, apart = _landmarks(request.landmarks, found, shared)
-    unit, scale = _unit(shared, index, request.unit or found.unit)
-    notes = [f"read as {unit}: {shared.name} is {base.bounding_box_size(shared.vertices) * scale:.3g} mm in size"]
-    if apart is not None:
+def _job(source: Source, out: Path, request: Request) -> tuple[worker.Job, list[str]]:
+    """Return what is known before the recordings are read, and notes on assumptions."""
+    reference = base.reference_mesh(source)
+    index, distance = _landmark_vertices(request.landmarks, source, reference)
+    unit, scale = _unit(reference, index, request.unit or source.unit)
+    size = base.bounding_box_size(reference.vertices)
+    notes = [f"read as {unit}: {reference.name} is {size * scale:.3g} mm in size"]
+    if distance is not None:
         notes.append(
-            f"{request.landmarks}: positions went to the nearest vertices, {apart * scale:.2g} mm away at most"
+            f"{request.landmarks}: positions moved to the nearest vertices, by {distance * scale:.2g} mm or less"
         )
-    if shared_by := len(index) - len(np.unique(index)):
-        notes.append(f"{request.landmarks}: {shared_by} of {len(index)} landmarks share a vertex with another")
-    notes += _faceless(shared.vertices[index], request.landmarks)
-    neutral = np.stack([worker.to_millimetres(base.neutral_vertices(found, i, shared), scale) for i in range(len(found.people))])
-    starts = np.cumsum([0, *(take.count for take in found.takes)])
-    most = 0 if found.landmarks_only else request.most
-    drawn = np.sort(np.random.default_rng([SEED, 2**20]).permutation(int(starts[-1]))[:most])
+    if duplicates := len(index) - len(np.unique(index)):
+        notes.append(f"{request.landmarks}: {duplicates} of {len(index)} landmarks share a vertex with another")
+    notes += _landmark_notes(reference.vertices[index], request.landmarks)
+    people = range(len(source.people))
+    neutral = [worker.to_millimetres(base.neutral_vertices(source, i, reference), scale) for i in people]
+    starts = np.cumsum([0, *(recording.num_frames for recording in source.recordings)])
+    count = 0 if source.landmarks_only else request.max_meshes
+    drawn = np.sort(np.random.default_rng([SEED, 2**20]).permutation(int(starts[-1]))[:count])
     part = out.absolute().parent / f".{out.name}.part"
-    hold = worker.stable_landmarks(index) if request.hold else None
-    return worker.Job(found, shared, index, unit, scale, neutral, starts, drawn, part, hold, dict(request.cuts)), notes
+    stable = worker.stable_landmarks(index) if request.remove_head_motion else None
+    phases = dict(request.phases)
+    job = worker.Job(source, reference, index, unit, scale, np.stack(neutral), starts, drawn, part, stable, phases)
+    return job, notes
 
 
-def _key(job: worker.Job, request: Request) -> str:
-    """What the bytes depend on."""
-    found = job.source
-    stats = [(path.as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in found.files]
-    rows = [take._replace(path="", frames=()) for take in found.takes]
-    parts = [found.layout, found.rate, found.people, rows, stats, job.index.tolist(), job.scale]
-    parts += [request.most, request.hold, sorted(request.cuts.items()), VERSION]
+def _request_hash(job: worker.Job, request: Request) -> str:
+    """Return a hash of everything that determines the dataset's bytes and the files of unfinished work."""
+    source = job.source
+    stats = [(path.as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
+    rows = [(*one[:3], *one[5:]) for one in source.recordings]  # without paths
+    parts = [source.layout, source.rate, source.people, rows, stats, job.landmark_index.tolist(), job.scale]
+    parts += [request.max_meshes, request.remove_head_motion, sorted(request.phases.items()), VERSION]
+    parts += [worker.Result._fields]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def _begin(part: Path, job: worker.Job, key: str) -> None:
-    """Make the folder of what is done, or go on in the one that is there, where it is of the same request."""
+def _begin(job: worker.Job, request_hash: str) -> None:
+    """Create the folder of unfinished work, or keep that of the same request."""
+    part = job.part
     mark = part / "request"
-    if mark.exists() and mark.read_text() == key:
+    if mark.exists() and mark.read_text() == request_hash:
         return
     shutil.rmtree(part, ignore_errors=True)
-    (part / "store").mkdir(parents=True)
+    (part / "dataset").mkdir(parents=True)
     (part / "done").mkdir()
-    shape = (len(job.drawn), *job.common.vertices.shape)
-    np.lib.format.open_memmap(part / "store" / "vertices.npy", "w+", np.float32, shape).flush()
+    shape = (len(job.drawn), *job.reference.vertices.shape)
+    np.lib.format.open_memmap(part / "dataset" / "vertices.npy", "w+", np.float32, shape).flush()
     with atomic.replace_file(mark) as temporary:
-        temporary.write_text(key)
+        temporary.write_text(request_hash)
 
 
 def _finish(job: worker.Job, notes: list[str], folder: Path) -> None:
-    """The files of the store besides the meshes, which lie there."""
-    found, people = job.source, job.source.people
-    rows, count = int(job.starts[-1]), len(job.index)
-    whole = {
-        "faces": job.common.faces,
+    """Write the files of the dataset besides the meshes, which are there already."""
+    source, people = job.source, job.source.people
+    rows, count = int(job.starts[-1]), len(job.landmark_index)
+    arrays = {
+        "faces": np.asarray(job.reference.faces),
         "neutral": job.neutral,
         "drawn": job.drawn,
-        "landmark_index": job.index,
+        "landmark_index": job.landmark_index,
     }
-    for name, array in whole.items():
+    for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
     curves = np.lib.format.open_memmap(folder / "landmarks.npy", "w+", np.float32, (rows, count, 3))
-    sequences, said = [], []
-    for number, take in enumerate(found.takes):
-        done = worker.load_result(job, number)
-        start = int(job.starts[number])
-        curves[start : start + take.count] = done.curve
-        timing = (*done.cuts, take.count / found.rate)
-        sequences.append(dataset.Sequence(take.subject, take.label, start, take.count, *timing, name=take.name))
-        said.append(done)
+    sequences, results = [], []
+    for number, recording in enumerate(source.recordings):
+        result = worker.load_result(job, number)
+        start, frames = int(job.starts[number]), recording.num_frames
+        curves[start : start + frames] = result.curve
+        owner, label, seconds = recording.subject, recording.label, frames / source.rate
+        sequences.append(dataset.Sequence(owner, label, start, frames, *result.phases, seconds, recording.name))
+        results.append(result)
     curves.flush()
     splits = _splits(people)
-    shapes = {name: array.shape for name, array in whole.items()} | {"landmarks": curves.shape}
-    shapes["vertices"] = (len(job.drawn), *job.common.vertices.shape)
+    shapes = {name: array.shape for name, array in arrays.items()} | {"landmarks": curves.shape}
+    shapes["vertices"] = (len(job.drawn), *job.reference.vertices.shape)
     sizes = {"subjects": len(people), "sequences": len(sequences), "frames": rows, "meshes": len(job.drawn)}
-    sizes |= {"vertices": job.common.vertices.shape[0], "landmarks": count}
+    sizes |= {"vertices": job.reference.vertices.shape[0], "landmarks": count}
+    phases = [[number, *phases] for number, phases in sorted(job.phases.items())]
     index: dict[str, Any] = {
         "schema": dataset.SCHEMA,
-        "name": found.layout,
+        "name": source.layout,
         "version": VERSION,
         "spec": {
-            "root": found.root.resolve().name,
+            "root": source.root.resolve().name,
             "unit": job.unit,
-            "rate": found.rate,
+            "rate": source.rate,
             **sizes,
-            "held": job.hold is not None,
-            "cuts_sha256": hashlib.sha256(repr(sorted(job.cuts.items())).encode()).hexdigest() if job.cuts else None,
-            "landmarks_sha256": hashlib.sha256(job.index.tobytes()).hexdigest(),
-            "files_sha256": base.fingerprint(found),
+            "held": job.stable is not None,
+            "cuts_sha256": hashlib.sha256(json.dumps(phases).encode()).hexdigest() if phases else None,
+            "landmarks_sha256": hashlib.sha256(job.landmark_index.tobytes()).hexdigest(),
+            "files_sha256": base.fingerprint(source),
         },
         "unit": "mm",
-        "rate": found.rate,
-        "labels": found.labels,
+        "rate": source.rate,
+        "labels": source.labels,
         "shapes": shapes,
         "hashes": {name: atomic.sha256(folder / f"{name}.npy") for name in shapes},
-        "subjects": [{"name": who.name, "split": split} | who.about for who, split in zip(people, splits, strict=True)],
+        "subjects": [
+            {"name": person.name, "split": split} | person.attributes
+            for person, split in zip(people, splits, strict=True)
+        ],
         "sequences": [sequence._asdict() for sequence in sequences],
-        "notes": notes + worker.notes(job, said) + _lacking(people, splits) + list(found.notes),
+        "notes": notes + worker.notes(job, results) + _empty_split_notes(people, splits) + list(source.notes),
     }
     (folder / "index.json").write_text(json.dumps(index))
 
 
-def _landmarks(path: Path | None, found: Source, shared: base.ReferenceMesh) -> tuple[np.ndarray, float | None]:
-    """Landmarks as vertices (L,); where the file gives places, how far from its vertex the farthest of them lies."""
+def _landmark_vertices(
+    path: Path | None, source: Source, reference: base.ReferenceMesh
+) -> tuple[np.ndarray, float | None]:
+    """Return landmarks as vertex indices (L,), and for a file of positions the largest distance to a vertex."""
     if path is None:
-        return found.landmarks.astype(np.int32), None
+        return np.asarray(source.landmarks, np.int32), None
     try:
-        marks = landmarks.read(path, shared.vertices, shared.faces)
+        found = landmarks.read(path, reference.vertices, reference.faces)
     except landmarks.LandmarkError as error:
         raise SourceError(str(error)) from error
-    if len(marks.points) < MIN_LANDMARKS:
-        raise SourceError(f"{path}: {len(marks.points)} landmarks, expected {MIN_LANDMARKS} or more")
-    if marks.index is not None:
-        return marks.index.astype(np.int32), None
-    distance, nearest = cKDTree(shared.vertices).query(marks.points)
-    if distance.max() > MAX_LANDMARK_DISTANCE * base.bounding_box_size(shared.vertices):
+    if len(found.points) < MIN_LANDMARKS:
+        raise SourceError(f"{path}: {len(found.points)} landmarks, expected {MIN_LANDMARKS} or more")
+    if found.index is not None:
+        return found.index.astype(np.int32), None
+    distance, nearest = spatial.KDTree(reference.vertices).query(found.points)
+    size = base.bounding_box_size(reference.vertices)
+    if distance.max() > MAX_LANDMARK_DISTANCE * size:
         worst = int(np.argmax(distance))
         raise SourceError(
-            f"{path}: landmark {worst} lies {distance[worst]:.3g} off {shared.name}, which is "
-            f"{base.bounding_box_size(shared.vertices):.3g} in size: another unit, or another mesh?"
+            f"{path}: landmark {worst} is {distance[worst]:.3g} away from {reference.name}, whose size is {size:.3g}: "
+            "another unit, or another mesh?"
         )
-    return nearest.astype(np.int32), float(distance.max())
+    return np.asarray(nearest, np.int32), float(distance.max())
 
 
-def _faceless(points: np.ndarray, path: Path | None) -> list[str]:
-    """What to say of landmarks of a known scheme that do not look like a face."""
-    known = canonical_frame.template68()
+def _landmark_notes(points: np.ndarray, path: Path | None) -> list[str]:
+    """Note landmarks (L, 3) of a known scheme that are not arranged like those of a face."""
+    template = canonical_frame.template68()
     try:
-        there, here = schemes.common(len(known), len(points))
+        in_template, in_points = schemes.common(len(template), len(points))
     except ValueError:
         return []
     try:
-        canonical_frame.align_to_template(points[here], known[there])
+        canonical_frame.align_to_template(points[in_points], template[in_template])
     except ValueError as error:
-        return [f"{path}: {error}; they are taken as they are"]
+        return [f"{path}: {error}; used without changes"]
     return []
 
 
-def _unit(shared: base.ReferenceMesh, index: np.ndarray, unit: str | None) -> tuple[str, float]:
-    """The unit's name and its millimetres: as named, by 68 landmarks, or by the size of the whole mesh."""
-    points, size = shared.vertices[index], base.bounding_box_size(shared.vertices)
-    known = canonical_frame.template68()
-    spread = canonical_frame.centred_norm(points) / canonical_frame.centred_norm(known) if len(index) == len(known) else None
+def _unit(reference: base.ReferenceMesh, index: np.ndarray, unit: str | None) -> tuple[str, float]:
+    """Return a unit's name and its millimetres: as given, or inferred from 68 landmarks or the size of the mesh."""
+    name, size = reference.name, base.bounding_box_size(reference.vertices)
+    template, spread = canonical_frame.template68(), None
+    if len(index) == len(template):
+        spread = canonical_frame.centred_norm(reference.vertices[index]) / canonical_frame.centred_norm(template)
     if unit is not None:
         scale = canonical_frame.UNITS[UNITS[unit]]
-        fits = SIZE_RANGE_MM[0] < size * scale < SIZE_RANGE_MM[1] and (spread is None or SPREAD_RATIO_RANGE[0] < spread * scale < SPREAD_RATIO_RANGE[1])
-        if not fits:
-            raise SourceError(f"{shared.name}: {size * scale:.3g} mm in size, read as {UNITS[unit]}: another unit?")
+        fits = SIZE_RANGE_MM[0] < size * scale < SIZE_RANGE_MM[1]
+        if not (fits and (spread is None or SPREAD_RATIO_RANGE[0] < spread * scale < SPREAD_RATIO_RANGE[1])):
+            raise SourceError(f"{name}: {size * scale:.3g} mm in size, read as {UNITS[unit]}: another unit?")
         return UNITS[unit], scale
     try:
-        scale, name = (
-            canonical_frame.infer_head_unit(size, shared.name)
-            if spread is None
-            else canonical_frame.infer_unit(spread, shared.name)
+        scale, found = (
+            canonical_frame.infer_head_unit(size, name) if spread is None else canonical_frame.infer_unit(spread, name)
         )
     except canonical_frame.FaceError as error:
         raise SourceError(f"{error}; or name the unit: {', '.join(UNITS)}") from error
-    return name, scale
+    return found, scale
 
 
 def _splits(people: tuple[base.Person, ...]) -> list[str]:
-    """Each person's split: as a table says, else by their order."""
+    """Return each person's split: that of the table of people, else by order."""
     count = len(people)
-    return [
-        who.about.get("split") or ("train" if count < 3 else makehuman4d.split_of(i, count))
-        for i, who in enumerate(people)
-    ]
+    by_order = [("train" if count < 3 else makehuman4d.split_of(i, count)) for i in range(count)]
+    return [person.attributes.get("split") or split for person, split in zip(people, by_order, strict=True)]
 
 
-def _lacking(people: tuple[base.Person, ...], splits: list[str]) -> list[str]:
-    lacking = [split for split in dataset.SPLITS if split not in splits]
-    told = any(who.about.get("split") for who in people)
-    why = "as the table of people has it" if told else f"all splits need 4 subjects or more, got {len(splits)}"
-    return [f"nobody serves {' and '.join(lacking)}: {why}"] if lacking else []
+def _empty_split_notes(people: tuple[base.Person, ...], splits: list[str]) -> list[str]:
+    empty = [split for split in dataset.SPLITS if split not in splits]
+    from_table = any(person.attributes.get("split") for person in people)
+    reason = "as the table of people defines" if from_table else f"4 subjects or more are needed, got {len(splits)}"
+    return [f"no subjects in the splits {' and '.join(empty)}: {reason}"] if empty else []

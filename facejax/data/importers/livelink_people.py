@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from facejax.data import blendshapes
 from facejax.data.importers import base, folder_scan
 from facejax.data.importers.base import Frame, Person, RecordingInfo, Source, SourceError
 from facejax.data.synthetic import assets, makehuman, makehuman4d, rig
@@ -87,10 +88,10 @@ def _csv_files(folder: Path) -> list[Path]:
 def _weights(path: Path, rate: float) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the rig's weights (T, U) above the performer's resting face, resampled, and notes on assumptions."""
     try:
-        resampled = livelink.resample(livelink.subtract_rest(livelink.read(path)), rate=rate)
+        resampled = blendshapes.resample(blendshapes.subtract_rest(livelink.read(path)), rate=rate)
     except livelink.RecordingError as error:
         raise SourceError(str(error)) from error
-    return livelink.unit_weights(resampled, rig.unit_names()), resampled.notes
+    return blendshapes.unit_weights(resampled, rig.unit_names()), resampled.notes
 
 
 @functools.lru_cache(maxsize=2)

@@ -56,7 +56,9 @@ def read(path: str | os.PathLike, required: Collection[str], optional: Collectio
     except csv.Error as error:
         raise SourceError(f"{path}: {error}") from error
     if len(table) < 2 or len(table) != len(lines):
-        raise SourceError(f"{path}: expected a row of column names and one or more rows of values, got {len(table)} rows")
+        raise SourceError(
+            f"{path}: expected a row of column names and one or more rows of values, got {len(table)} rows"
+        )
     names = [name.strip().lower() for name in table[0]]
     missing = [name for name in required if name not in names]
     unknown = [] if optional is None else [name for name in names if name not in {*required, *optional}]

@@ -1,6 +1,7 @@
-"""Recordings read, checked and written one after the other, by one process or several.
+"""Import of single recordings: read, check and write them, in one process or several.
 
-Each recording that is done leaves a file, so that it is not read again. T frames, N vertices, L landmarks.
+Each recording that is done leaves a result file, so that an interrupted import resumes without reading it again.
+T frames, N vertices, L landmarks, S subjects, G stored meshes.
 """
 
 from __future__ import annotations
@@ -22,40 +23,49 @@ from facejax.geometry import host
 from facejax.io import atomic
 from facejax.landmarks import schemes
 
-MIN_PARALLEL_FRAMES = 2_000  # frames, from which on other processes are worth their start
+MIN_PARALLEL_FRAMES = 2_000  # below, starting other processes takes longer than it saves
 
 
 class Job(NamedTuple):
-    """All that a recording is read with."""
+    """Everything that the import of a recording depends on."""
 
     source: base.Source
-    common: base.ReferenceMesh
-    index: np.ndarray  # (L,) int32 landmarks as vertices
-    unit: str  # its name
-    scale: float  # its millimetres
+    reference: base.ReferenceMesh
+    landmark_index: np.ndarray  # (L,) int32 vertex indices
+    unit: str  # name of the source's unit
+    scale: float  # millimetres per unit
     neutral: np.ndarray  # (S, N, 3) float32 mm
-    starts: np.ndarray  # of each recording's rows, and their end
-    drawn: np.ndarray  # (G,) rows whose meshes are kept
-    part: Path  # the folder of what is done
-    hold: np.ndarray | None  # landmarks that stay put in the head's own frame, to take its motion out
-    cuts: dict[int, apex_detection.Phases]
+    starts: np.ndarray  # first row of each recording, and the number of rows
+    drawn: np.ndarray  # (G,) rows whose meshes are stored
+    part: Path  # folder of unfinished work
+    stable: np.ndarray | None  # landmarks that hardly move relative to the skull, to remove head motion
+    phases: dict[int, apex_detection.Phases]  # known ones, by number of recording
 
 
 class Result(NamedTuple):
-    """A recording that was read."""
+    """What is kept of an imported recording besides its meshes."""
 
     curve: np.ndarray  # (T, L, 3) float32 mm
-    cuts: apex_detection.Phases
-    restless: tuple[bool, bool]  # does not begin, does not end at rest
-    visits: int  # how often it goes to an expression and comes home
-    jumps: list[int]
+    phases: apex_detection.Phases
+    not_at_rest: tuple[bool, bool]  # does not begin, does not end at rest
+    returns: int  # number of separate expressions
+    jumps: list[int]  # frames that the landmarks jump to
 
 
 def import_all(job: Job, workers: int | None, progress: Callable[[int, int], None]) -> None:
-    """Do what is not done yet. Raises `SourceError` of the first recording in order that has something wrong."""
-    total = len(job.source.takes)
-    todo = [number for number in range(total) if not _path(job, number).exists()]
-    frames = sum(job.source.takes[number].count for number in todo)
+    """Import all recordings that are not done yet.
+
+    Args:
+      job: of all recordings.
+      workers: processes; None takes one per processor where there are many frames.
+      progress: called with (done, total) recordings.
+
+    Raises:
+      SourceError: of the first recording, in order, that cannot be used.
+    """
+    total = len(job.source.recordings)
+    todo = [number for number in range(total) if not _result_path(job, number).exists()]
+    frames = sum(job.source.recordings[number].num_frames for number in todo)
     workers = workers or (min(os.cpu_count() or 1, len(todo)) if frames > MIN_PARALLEL_FRAMES else 1)
     if workers <= 1:
         for done, number in enumerate(todo, 1):
@@ -66,7 +76,7 @@ def import_all(job: Job, workers: int | None, progress: Callable[[int, int], Non
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, _start, (job,)) as pool:
         try:
-            for done, _ in enumerate(pool.map(_do, todo), 1):
+            for done, _ in enumerate(pool.map(_import, todo), 1):
                 progress(total - len(todo) + done, total)
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -74,107 +84,120 @@ def import_all(job: Job, workers: int | None, progress: Callable[[int, int], Non
 
 
 def import_recording(job: Job, number: int) -> None:
-    """Read and check a recording, write its drawn meshes into the store, and leave the rest in a file."""
-    take, start = job.source.takes[number], int(job.starts[number])
-    if take.count < 2:
-        raise SourceError(f"{take.path}: 1 frame, expected 2 or more")
-    rest = job.neutral[take.subject]
-    curve = np.empty((take.count, len(job.index), 3), np.float32)
-    low, high = np.searchsorted(job.drawn, [start, start + take.count])
-    place = dict(zip((job.drawn[low:high] - start).tolist(), range(low, high), strict=True))
-    kept = np.lib.format.open_memmap(job.part / "store" / "vertices.npy", "r+") if place else None
-    read = -1
-    for read, frame in enumerate(job.source.read(take, None)):
-        if read >= take.count:
+    """Read and check a recording, write its stored meshes into the dataset, and its `Result` into a file.
+
+    Raises:
+      SourceError: a frame cannot be used, the recording has one frame, or contains no motion.
+    """
+    recording, start = job.source.recordings[number], int(job.starts[number])
+    if recording.num_frames < 2:
+        raise SourceError(f"{recording.path}: 1 frame, expected 2 or more")
+    neutral = job.neutral[recording.subject]
+    curve = np.empty((recording.num_frames, len(job.landmark_index), 3), np.float32)
+    low, high = np.searchsorted(job.drawn, [start, start + recording.num_frames])
+    position = dict(zip((job.drawn[low:high] - start).tolist(), range(low, high), strict=True))
+    stored = np.lib.format.open_memmap(job.part / "dataset" / "vertices.npy", "r+") if position else None
+    count = 0
+    for i, frame in enumerate(job.source.read_frames(recording, None)):
+        count = i + 1
+        if count > recording.num_frames:
             break
-        vertices = to_millimetres(job.common.check(*frame), job.scale)
-        if job.hold is not None:
-            vertices = _held(vertices, rest, job.index[job.hold])
-        curve[read] = vertices[job.index]
-        if read in place:
-            kept[place[read]] = vertices
-    if read + 1 != take.count:
-        raise SourceError(f"{take.path}: has changed, expected {take.count} frames")
-    if kept is not None:
-        kept.flush()
-    marks = rest[job.index]
-    if apex_detection.mean_displacement(curve, marks).max() < apex_detection.MIN_MOTION_MM:
-        raise SourceError(f"{take.path}: its landmarks never leave the face at rest, expected a motion")
-    cut = job.cuts.get(number) or take.cuts or apex_detection.detect(curve, marks)
-    restless = apex_detection.not_at_rest(curve, marks, apex_detection.Phases(*cut))
-    with atomic.replace_file(_path(job, number)) as temporary:
-        visits = apex_detection.count_returns(curve, marks)
-        jumps = np.array(apex_detection.detect_jumps(curve), np.int64)
-        np.savez(temporary, curve=curve, cuts=cut, restless=restless, visits=visits, jumps=jumps)
+        vertices = to_millimetres(job.reference.check(*frame), job.scale)
+        if job.stable is not None:
+            vertices = _remove_rigid_motion(vertices, neutral, job.landmark_index[job.stable])
+        curve[i] = vertices[job.landmark_index]
+        if stored is not None and i in position:
+            stored[position[i]] = vertices
+    if count != recording.num_frames:
+        raise SourceError(f"{recording.path}: changed during the import, expected {recording.num_frames} frames")
+    if stored is not None:
+        stored.flush()
+    rest = neutral[job.landmark_index]
+    if apex_detection.mean_displacement(curve, rest).max() < apex_detection.MIN_MOTION_MM:
+        raise SourceError(f"{recording.path}: the recording contains no motion")
+    known = job.phases.get(number) or recording.phases
+    phases = apex_detection.Phases(*known) if known else apex_detection.detect(curve, rest)
+    with atomic.replace_file(_result_path(job, number)) as temporary:
+        np.savez(
+            temporary,
+            curve=curve,
+            phases=phases,
+            not_at_rest=apex_detection.not_at_rest(curve, rest, phases),
+            returns=apex_detection.count_returns(curve, rest),
+            jumps=np.array(apex_detection.detect_jumps(curve), np.int64),
+        )
 
 
 def load_result(job: Job, number: int) -> Result:
-    """What `import_recording` left."""
-    with np.load(_path(job, number), allow_pickle=False) as found:
-        cut = apex_detection.Phases(*found["cuts"].tolist())
-        restless, visits = tuple(found["restless"].tolist()), int(found["visits"])
-        return Result(found["curve"], cut, restless, visits, found["jumps"].tolist())
+    """Load the result file that `import_recording` wrote."""
+    with np.load(_result_path(job, number), allow_pickle=False) as file:
+        phases = apex_detection.Phases(*file["phases"].tolist())
+        begin, end = file["not_at_rest"].tolist()
+        return Result(file["curve"], phases, (begin, end), int(file["returns"]), file["jumps"].tolist())
 
 
-def notes(job: Job, done: list[Result]) -> list[str]:
-    """What is odd in the recordings."""
-    said, names = [], [take.name for take in job.source.takes]
+def notes(job: Job, results: list[Result]) -> list[str]:
+    """Return notes on recordings that look unusual."""
+    found, names = [], [recording.name for recording in job.source.recordings]
     for i, verb in enumerate(("begin", "end")):
-        which = [name for name, one in zip(names, done, strict=True) if one.restless[i]]
-        if which:
-            said.append(
-                f"{len(which)} of {len(names)} recordings do not {verb} at rest: {base.abbreviate_names(which)}"
+        listed = [name for name, one in zip(names, results, strict=True) if one.not_at_rest[i]]
+        if listed:
+            found.append(
+                f"{len(listed)} of {len(names)} recordings do not {verb} at rest: {base.abbreviate_names(listed)}"
             )
-    several = [name for name, one in zip(names, done, strict=True) if one.visits > 1]
+    several = [name for name, one in zip(names, results, strict=True) if one.returns > 1]
     if several:
-        said.append(
-            f"{len(several)} of {len(names)} recordings come home more than once, as if they held several expressions: "
-            f"{base.abbreviate_names(several)}"
+        found.append(
+            f"{len(several)} of {len(names)} recordings return to rest more than once, and may contain several "
+            f"expressions: {base.abbreviate_names(several)}"
         )
-    jumps = [f"{name} frame {frame}" for name, one in zip(names, done, strict=True) for frame in one.jumps]
+    jumps = [f"{name} frame {frame}" for name, one in zip(names, results, strict=True) for frame in one.jumps]
     if jumps:
-        said.append(f"the landmarks jump at {base.abbreviate_names(jumps)}")
-    return said
+        found.append(f"the landmarks jump at {base.abbreviate_names(jumps)}")
+    return found
 
 
 def stable_landmarks(index: np.ndarray) -> np.ndarray:
-    """Which of L landmarks stay put in the head's own frame. Raises `SourceError` where the scheme is unknown."""
+    """Return which of L landmarks hardly move relative to the skull. Raises `SourceError` for an unknown scheme."""
     try:
         return np.asarray(schemes.by_count(len(index)).stable)
     except ValueError as error:
-        raise SourceError(f"to hold heads still, landmarks of a known scheme are needed: {error}") from error
+        raise SourceError(f"head motion (--hold) cannot be removed: {error}") from error
 
 
 def to_millimetres(vertices: np.ndarray, scale: float) -> np.ndarray:
-    """float32, in mm."""
+    """Return vertices in millimetres, float32."""
     return (vertices * scale).astype(np.float32)
 
 
-def _held(vertices: np.ndarray, rest: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Vertices (N, 3) turned and moved so that those at `at` lie as near as can be to where they rest."""
-    rotation, from_, to = host.procrustes(vertices[at], rest[at])
-    return ((vertices - from_) @ rotation.T + to).astype(np.float32)
+def _remove_rigid_motion(vertices: np.ndarray, neutral: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Align vertices (N, 3) rigidly so that those at `index` fit their neutral positions in the least squares sense."""
+    rotation, source, target = host.procrustes(vertices[index], neutral[index])
+    return ((vertices - source) @ rotation.T + target).astype(np.float32)
 
 
-def _path(job: Job, number: int) -> Path:
+def _result_path(job: Job, number: int) -> Path:
     return job.part / "done" / f"{number:06d}.npz"
 
 
-_JOB: Job | None = None  # of this process
+_job: Job | None = None  # of this process
 
 
 def _start(job: Job) -> None:
-    global _JOB
-    _JOB = job
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is told, and lets recordings come to their end
-    threading.Thread(target=_follow, daemon=True).start()
+    global _job
+    _job = job
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it, and lets running recordings finish
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def _follow() -> None:
-    """End with the parent, however that ends."""
-    multiprocessing.parent_process().join()
+def _exit_with_parent() -> None:
+    """Exit when the parent does, even if it is killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
     os._exit(1)
 
 
-def _do(number: int) -> None:
-    import_recording(_JOB, number)
+def _import(number: int) -> None:
+    assert _job is not None
+    import_recording(_job, number)

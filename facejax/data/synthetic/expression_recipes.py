@@ -29,11 +29,11 @@ LABELS = (NEUTRAL, *EXPRESSIONS)
 
 
 class Recipe(NamedTuple):
-    """Units at weight 1 of an expression. "*" in a unit's name stands for both sides."""
+    """Unit weights of an expression at full intensity. "*" in a unit's name stands for Left and Right."""
 
     units: dict[str, float]
-    variants: tuple[tuple[float, dict[str, float]], ...] = ()  # (chance, units added): exactly one is chosen
-    extras: tuple[tuple[float, dict[str, float]], ...] = ()  # (chance, units added): each on its own
+    variants: tuple[tuple[float, dict[str, float]], ...] = ()  # (probability, units added): exactly one is chosen
+    extras: tuple[tuple[float, dict[str, float]], ...] = ()  # (probability, units added): each independently
 
 
 RECIPES = {

@@ -1,8 +1,7 @@
-"""People: MakeHuman heads drawn by seed.
+"""Synthetic people: MakeHuman heads, sampled by seed.
 
-A subject is a mixture of ethnicities, a gender, a continuous adult age, a body weight and a few hundred detail
-sliders. Subject `i` of seed `s` is the same for every caller: its numbers come from the generator seeded with (s,
-i) alone.
+A subject has a mixture of ethnicities, a gender, a continuous adult age, a body weight and a few hundred detail
+sliders. Subject `i` of seed `s` is always the same: all its numbers come from a generator seeded with (s, i).
 
 Coordinates: millimetres, y up, z forward, the origin at the centroid of the subject's neutral skin.
 """
@@ -19,7 +18,7 @@ import numpy as np
 from facejax.data.synthetic import assets
 
 SLIDER_SPREAD = 0.22  # standard deviation of a slider whose range is -1..1
-ASYMMETRY_SPREAD = 0.12  # of each side's own deviation from the shared value
+ASYMMETRY_SPREAD = 0.12  # standard deviation of each side from the shared value
 OPPOSITES = (
     ("decr", "incr"),
     ("down", "up"),
@@ -28,16 +27,16 @@ OPPOSITES = (
     ("concave", "convex"),
     ("compress", "uncompress"),
 )
-# Caricature: a pointed ear or a square skull at full weight is no person that a scanner has seen.
+# Caricatures, such as pointed ears or a square skull: at full weight they do not occur in scanned people.
 CARICATURE = re.compile(
     r"ear-shape|head-(square|triangular|invertedtriangular|diamond|rectangular)|nubian|chin-triangle"
 )
-# The face is moved as a whole by these, which changes nothing once the head is centred.
+# These translate the whole face, which has no effect once the head is centred.
 PLACEMENT = re.compile(r"head-trans|neck-trans|neck-height|measure-neck")
 
 
 class Template(NamedTuple):
-    """The topology that all subjects share, on the average young adult."""
+    """The topology that all subjects share, with the geometry of the average young adult."""
 
     vertices: np.ndarray  # (N, 3) float32
     faces: np.ndarray  # (F, 3) int32
@@ -61,7 +60,7 @@ class Subject(NamedTuple):
 
 
 def template() -> Template:
-    """The average young adult: equal ethnicities and genders, no sliders."""
+    """Return the average young adult: equal ethnicities and genders, no sliders."""
     loaded = assets.load()
     packed = np.frombuffer(resources.files("facejax.assets").joinpath("face_mask.bin").read_bytes(), np.uint8)
     mask = np.unpackbits(packed)[: loaded.skin].astype(bool)
@@ -69,12 +68,12 @@ def template() -> Template:
 
 
 def average() -> Subject:
-    """The template as a person, with eyes and teeth."""
+    """Return the template as a subject, with eyes and teeth."""
     return Subject("average", _compose(np.full(3, 1 / 3), 0.5, 25.0, 0.0, {}), np.full(3, 1 / 3), 0.5, 25.0)
 
 
 def subject(index: int, *, seed: int = 1) -> Subject:
-    """Subject `index` (0 or more) of the population that `seed` names."""
+    """Return subject `index` (0 or more) of the population of `seed`. Raises `ValueError` for a negative index."""
     if index < 0:
         raise ValueError(f"subject index must be 0 or more, got {index}")
     rng = np.random.default_rng([seed, index])
@@ -88,7 +87,7 @@ def subject(index: int, *, seed: int = 1) -> Subject:
 
 @functools.cache
 def _sliders() -> tuple[tuple[str, str | None], ...]:
-    """(positive target, negative target or None) of each slider, in a fixed order."""
+    """Return (positive target, negative target or None) of each slider, in a fixed order."""
     found = {}
     names = [n for n in assets.load().targets if n.split("/")[0] in assets.SLIDER_FOLDERS]
     for name in sorted(names):
@@ -103,7 +102,7 @@ def _sliders() -> tuple[tuple[str, str | None], ...]:
 
 
 def _draw_sliders(rng: np.random.Generator) -> dict[str, float]:
-    """Weights in 0..1 by target name. The sides of a face share most of a slider's value."""
+    """Sample weights in 0..1 by target name. Left and right share most of a slider's value."""
     shared, weights = {}, {}
     for positive, negative in _sliders():
         folder, name = positive.split("/")
@@ -123,12 +122,12 @@ def _draw_sliders(rng: np.random.Generator) -> dict[str, float]:
 
 
 def _truncated_normal(rng: np.random.Generator, limit: float = 2.0) -> float:
-    # Always one draw, so that no value depends on how often an earlier one was rejected.
+    # Clipped, not rejected: every value takes exactly one draw.
     return float(np.clip(rng.standard_normal(), -limit, limit))
 
 
 def _compose(ethnicity: np.ndarray, gender: float, age: float, weight: float, sliders: dict[str, float]) -> np.ndarray:
-    """Base mesh plus weighted targets, centred: (M, 3) float32."""
+    """Return the base mesh plus weighted targets, centred, (M, 3) float32."""
     loaded = assets.load()
     old = np.clip((age - 25.0) / 65.0, 0.0, 1.0)  # MakeHuman's "young" is 25 and its "old" 90
     heavy, light = max(weight, 0.0), max(-weight, 0.0)
@@ -147,15 +146,16 @@ def _compose(ethnicity: np.ndarray, gender: float, age: float, weight: float, sl
 
 
 def template_props() -> tuple[np.ndarray, ...]:
-    """The template's eyes and teeth.
+    """Return the template's eyes and teeth.
 
-    Centres (2, 3) and radii (2,) of the left and right eyeball; vertices and triangles of the upper teeth, then of the
-    lower.
+    Returns:
+      Centres (2, 3) and radii (2,) of the left and right eyeball, then vertices and triangles of the upper and of the
+      lower teeth.
     """
     loaded = assets.load()
     whole = average().neutral
     eyes = [whole[np.unique(loaded.prop_faces[name])] for name in ("helper-l-eye", "helper-r-eye")]
-    # A little smaller and further back than the prop, whose cornea bulges through the lids.
+    # Slightly smaller and further back than the prop, whose cornea would intersect the lids.
     centres = np.stack([(eye.min(axis=0) + eye.max(axis=0)) / 2 - [0, 0, 0.8] for eye in eyes])
     radii = np.array([np.ptp(eye[:, 0]) / 2 - 0.5 for eye in eyes])
     found = [centres.astype(np.float32), radii.astype(np.float32)]

@@ -1,9 +1,12 @@
-"""makehuman4d: 4D expressions on MakeHuman heads, the dataset that everybody has.
+"""makehuman4d: a free synthetic dataset of 4D expressions on MakeHuman heads.
 
 Version 1: 120 subjects (80 train, 20 validation, 20 test), 18 expressions each, neutral -> apex -> neutral, and for
 validation and test subjects the direct transitions between the expressions of OT23's Table 5. Four levels of
-realism (`facejax.data.rig`). Landmarks of every frame; meshes of a fixed draw of 20,000 frames. The same seed gives
-the same bytes on one machine. A later change of anything that alters a number is version 2."""
+realism (`facejax.data.synthetic.rig`). Landmarks of every frame; meshes of a fixed sample of 20,000 frames. The same
+seed gives the same bytes on one machine. Any change that alters a number requires version 2.
+
+T frames, N skin vertices.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ from facejax.io import atomic, cache
 
 VERSION = 1
 SEED = 1
-CHUNK = 256  # frames posed at a time: bounds the memory to about 60 MB
-NECK = np.array([0.0, -95.0, -30.0], np.float32)  # about which the head turns
+CHUNK = 256  # frames posed at a time; bounds the memory to about 60 MB
+NECK = np.array([0.0, -95.0, -30.0], np.float32)  # pivot of the head's rotation
 
-# OT23, Table 5: the 39 transitions that the paper judges.
+# OT23, Table 5: the 39 transitions of the paper's evaluation.
 TABLE5 = {
     "bareteeth": ("high_smile", "lips_back", "lips_up"),
     "cheeks_in": ("mouth_down", "mouth_extreme", "mouth_middle"),
@@ -43,14 +46,14 @@ TABLE5_PAIRS = tuple((start, end) for start, ends in TABLE5.items() for end in e
 
 
 class Spec(NamedTuple):
-    """What determines the bytes of a dataset."""
+    """Parameters that determine the bytes of a dataset."""
 
     level: int = 3
     subjects: int = 120
     meshes: int = 20_000
     seed: int = SEED
     head_motion: bool = False
-    noise: float = 0.0  # registration noise, mm in root mean square
+    noise: float = 0.0  # registration noise, root mean square in mm
 
     @property
     def name(self) -> str:
@@ -64,21 +67,27 @@ class Spec(NamedTuple):
 def prepare(
     spec: Spec = Spec(), *, folder: Path | None = None, progress: Callable[[int, int], None] | None = None
 ) -> dataset.Dataset:
-    """Open the dataset, making it first if it is absent (minutes; `progress(done, total)` counts subjects)."""
+    """Open the dataset; generate it first if it does not exist, which takes minutes.
+
+    Args:
+      spec: what to generate.
+      folder: where the dataset's own folder is, or is created; by default the cache.
+      progress: called with (done, total) subjects.
+    """
     path = Path(folder or cache.folder()) / spec.name
     if not (path / "index.json").exists():
-        _make(spec, path, progress or (lambda done, total: None))
+        _generate(spec, path, progress or (lambda done, total: None))
     return dataset.open_dataset(path)
 
 
 def split_of(index: int, subjects: int) -> str:
-    """The first two thirds train, the next sixth validates, the last sixth tests."""
+    """Return the split of a subject: the first two thirds train, the next sixth validates, the last sixth tests."""
     return "train" if index < subjects * 2 // 3 else "validation" if index < subjects * 5 // 6 else "test"
 
 
 def _plan(spec: Spec) -> tuple[list[dataset.Sequence], list[np.ndarray], list[np.ndarray]]:
-    """Every sequence with its unit weights and head turns; nothing is posed yet."""
-    sequences, weights, turns, start = [], [], [], 0
+    """Return all sequences with their unit weights (T, U) and head rotations (T, 3)."""
+    sequences, weights, rotations, start = [], [], [], 0
     for index in range(spec.subjects):
         takes = [(label, performance.perform(label, index, seed=spec.seed)) for label in expression_recipes.EXPRESSIONS]
         if split_of(index, spec.subjects) != "train":
@@ -87,9 +96,9 @@ def _plan(spec: Spec) -> tuple[list[dataset.Sequence], list[np.ndarray], list[np
             marks = (take.onset, take.apex_start, take.apex_end, take.offset)
             sequences.append(dataset.Sequence(index, label, start, len(take.weights), *marks, take.duration))
             weights.append(take.weights)
-            turns.append(take.head)
+            rotations.append(take.head)
             start += len(take.weights)
-    return sequences, weights, turns
+    return sequences, weights, rotations
 
 
 def _direct(start: str, end: str, index: int, seed: int) -> performance.Performance:
@@ -99,9 +108,9 @@ def _direct(start: str, end: str, index: int, seed: int) -> performance.Performa
     return performance.Performance(weights, np.zeros((len(weights), 3), np.float32), 0, last, last, last, duration)
 
 
-def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
+def _generate(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
     loaded = assets.load()
-    sequences, weights, turns = _plan(spec)
+    sequences, weights, rotations = _plan(spec)
     first = np.array([s.start for s in sequences] + [sequences[-1].start + sequences[-1].frames])
     expressions = np.concatenate([np.arange(s.start, s.start + s.frames) for s in sequences if ">" not in s.label])
     draw = np.random.default_rng([spec.seed, 2**20]).permutation(expressions)[: spec.meshes]
@@ -126,7 +135,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
             neutral[index] = person.vertices
             mine = [i for i, s in enumerate(sequences) if s.subject == index]
             moves = np.concatenate([weights[i] for i in mine])
-            head = np.concatenate([turns[i] for i in mine])
+            head = np.concatenate([rotations[i] for i in mine])
             posed = rig.build(person, level=spec.level)
             for low in range(0, len(moves), CHUNK):
                 skin = rig.pose(posed, moves[low : low + CHUNK])[:, : loaded.skin]
@@ -172,7 +181,7 @@ def _make(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> None:
 
 
 def rotate_head(vertices: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Rigid head motion about the neck: vertices (T, N, 3), angles (T, 3) pitch (back), yaw, roll in radians."""
+    """Rotate vertices (T, N, 3) about the neck by angles (T, 3): pitch (positive leans back), yaw, roll in radians."""
     pitch, yaw, roll = np.moveaxis(np.asarray(angles, np.float64), -1, 0)
     one, zero = np.ones_like(pitch), np.zeros_like(pitch)
     c, s = np.cos, np.sin

@@ -1,7 +1,7 @@
-"""Registration noise: what fitting a template to scans leaves behind, smooth over the surface, new in every frame.
+"""Registration noise: the error of fitting a template to scans, smooth over the surface, independent in every frame.
 
-A field is a sum of Gaussian bumps about centres spread over the template, with random heights, scaled so that every
-vertex moves by `sigma` millimetres in root mean square. N vertices, C centres.
+A field is a sum of Gaussian bumps at centres spread over the template, with random heights, scaled so that the
+displacement of every vertex is `sigma` millimetres in root mean square. N vertices, C centres.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MAX_SIGMA_MM = 2.0  # millimetres
 
 
 def field(frames: int, rng: np.random.Generator, *, sigma: float) -> np.ndarray:
-    """Displacements (frames, N, 3) float32. Raises `ValueError` for a sigma outside 0..2 mm."""
+    """Sample displacements (frames, N, 3) float32, mm. Raises `ValueError` for a sigma outside 0..2 mm."""
     check_sigma(sigma)
     basis = _basis()
     heights = rng.standard_normal((frames, 3, basis.shape[1]), np.float32)
@@ -34,13 +34,13 @@ def check_sigma(sigma: float) -> None:
 
 @functools.cache
 def _basis() -> np.ndarray:
-    """(N, C) bumps; the squares of every row sum to 1, so that each vertex has the same variance."""
+    """Return the bumps (N, C); the squares of every row sum to 1, so that each vertex has the same variance."""
     shape = makehuman.template()
-    distance = [graph.geodesic(shape.vertices, shape.faces, [0])]
+    distance = [graph.geodesic(shape.vertices, shape.faces, np.array([0]))]
     nearest = distance[0]
-    # Farthest points first, until the surface is covered.
+    # Farthest point sampling, until the surface is covered.
     while nearest.max() > WIDTH / SPACING:
-        distance.append(graph.geodesic(shape.vertices, shape.faces, [int(np.argmax(nearest))]))
+        distance.append(graph.geodesic(shape.vertices, shape.faces, np.array([np.argmax(nearest)])))
         nearest = np.minimum(nearest, distance[-1])
     bumps = np.exp(-0.5 * (np.stack(distance, axis=1) / WIDTH) ** 2)
     return (bumps / np.linalg.norm(bumps, axis=1, keepdims=True)).astype(np.float32)

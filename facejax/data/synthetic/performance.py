@@ -1,11 +1,13 @@
-"""Expressions performed: a label, a subject and a take give the weight of every unit over time.
+"""Performances of expressions: unit weights over time for a label, a subject and a take.
 
-A recipe says what an expression is; a style says how this subject does it (one brow or both, left or right,
-stronger or weaker units); a take adds what differs from one try to the next. Time: neutral, a minimum-jerk onset,
-an apex held with a small tremor, a minimum-jerk offset, neutral. Every unit has its own lag, speed and overshoot,
-so that the path of the landmarks bends. Performed at 60 frames per second, 60 to 140 frames; handed out at 30.
+A recipe (`facejax.data.synthetic.expression_recipes`) defines the units of an expression. The subject's style selects
+a variant of it (one brow or both, left or right) and scales the units; a take adds variation between repetitions. A
+performance consists of neutral, a minimum-jerk onset, an apex held with a small tremor, a minimum-jerk offset, and
+neutral. Every unit has its own lag, speed and overshoot, so that landmarks move on curved paths. It is sampled at 60
+frames per second, 60 to 140 frames, and stored at 30.
 
-Randomness: the generator of a style is seeded with (seed, subject, label), that of a take with the take's number too.
+The random generator of a style is seeded with (seed, subject, label), that of a take also with the take's number.
+T frames, U units.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ ASYMMETRY_SPREAD, TAKE_SPREAD = 0.08, 0.05
 
 
 class Performance(NamedTuple):
-    """One take: weights at 30 frames per second, and its marks as frame numbers of the same."""
+    """One take at 30 frames per second, with the frame numbers of its phases."""
 
     weights: np.ndarray  # (T, U) float32
     head: np.ndarray  # (T, 3) float32: pitch, yaw, roll in radians, positive pitch leans back
@@ -36,7 +38,11 @@ class Performance(NamedTuple):
 
 
 def apex_weights(label: str, subject: int, *, seed: int = 1) -> np.ndarray:
-    """How a subject performs an expression: unit weights (U,) at the apex. Neutral is zero."""
+    """Return the unit weights (U,) of a subject's expression at the apex; zero for neutral.
+
+    Raises:
+      ValueError: the label is unknown.
+    """
     names = rig.unit_names()
     weights = np.zeros(len(names))
     if label == expression_recipes.NEUTRAL:
@@ -60,7 +66,7 @@ def apex_weights(label: str, subject: int, *, seed: int = 1) -> np.ndarray:
 
 
 def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Performance:
-    """Neutral -> apex -> neutral."""
+    """Return a performance from neutral to the apex and back."""
     rng = np.random.default_rng([seed, subject, 1 + expression_recipes.EXPRESSIONS.index(label), 1 + take])
     apex = apex_weights(label, subject, seed=seed) * np.exp(TAKE_SPREAD * rng.standard_normal(len(rig.unit_names())))
     rest_before, rise = rng.integers(4, 10), rng.integers(18, 40)
@@ -78,20 +84,20 @@ def perform(label: str, subject: int, *, take: int = 0, seed: int = 1) -> Perfor
 
 
 def perform_direct(start: str, end: str, subject: int, *, take: int = 0, seed: int = 1, frames: int = 30) -> np.ndarray:
-    """A transition performed directly, apex to apex, not through neutral: unit weights (frames, U)."""
+    """Return the unit weights (frames, U) of a direct transition, from apex to apex without passing neutral."""
     labels = [expression_recipes.LABELS.index(start), expression_recipes.LABELS.index(end)]
     rng = np.random.default_rng([seed, subject, 1000 + labels[0], 1000 + labels[1], take])
     first, second = apex_weights(start, subject, seed=seed), apex_weights(end, subject, seed=seed)
     length = float(rng.integers(24, 46))
     time = np.linspace(0, length, frames)
-    # The muscles of the old expression let go while those of the new one already pull: two clocks.
+    # The first expression relaxes while the second one already begins, each with timing of its own.
     away = _activation(time, 0.0, 0.9 * length, len(first), rng)
     toward = _activation(time, 0.05 * length, 0.95 * length, len(first), rng)
     return (first * (1 - away) + second * toward).astype(np.float32)
 
 
 def _person(subject: int, seed: int) -> np.ndarray:
-    """A subject's gain per unit in every expression: expressivity, and one side stronger than the other."""
+    """Return a subject's gain per unit (U,) for all expressions, with one side stronger than the other."""
     rng = np.random.default_rng([seed, subject, 0])
     side = ASYMMETRY_SPREAD * rng.standard_normal()
     lean = np.array([side * _side(name) for name in rig.unit_names()])
@@ -105,7 +111,7 @@ def _side(name: str) -> int:
 
 @functools.cache
 def _partner() -> np.ndarray:
-    """For each unit the one whose draw it shares: the left one of a pair, else itself."""
+    """Return for each unit the one whose random value it shares: the left one of a pair, else itself."""
     names = rig.unit_names()
     return np.array([names.index(n.replace("Right", "Left").replace("-right-", "-left-")) for n in names])
 
@@ -115,7 +121,10 @@ def _same_on_both_sides(values: np.ndarray) -> np.ndarray:
 
 
 def _activation(time, begin, length, units, rng) -> np.ndarray:
-    """Minimum-jerk rise from 0 to 1 per unit, (T, units): own lag, speed and overshoot, all at 1 by begin + length."""
+    """Return a minimum-jerk rise from 0 to 1 per unit, (T, units), with individual lag, speed and overshoot.
+
+    All units reach 1 by begin + length.
+    """
     lag = _same_on_both_sides(rng.uniform(0.0, 0.3, units))
     speed = _same_on_both_sides(rng.uniform(0.75, 1.0, units))
     overshoot = _same_on_both_sides(np.clip(rng.normal(0.03, 0.03, units), 0, 0.1))
@@ -126,7 +135,7 @@ def _activation(time, begin, length, units, rng) -> np.ndarray:
 
 
 def _tremor(time, units, rng) -> np.ndarray:
-    """A held pose is never still: two slow sines of one per cent each, per unit."""
+    """Return a relative tremor (T, units): two slow sines of about one per cent each, per unit."""
     seconds = time[:, None] / RATE
     total = 0.0
     for low, high in ((1.0, 2.5), (2.5, 5.0)):
@@ -136,6 +145,6 @@ def _tremor(time, units, rng) -> np.ndarray:
 
 
 def _lean(label: str, rng) -> np.ndarray:
-    """Pitch, yaw, roll at the apex: everybody sways a little, surprise leans back, sadness bows."""
+    """Return pitch, yaw, roll at the apex: random sway, plus leaning back in surprise and bowing in sadness."""
     pitch = {"surprise": 0.12, "fear": 0.08, "sadness": -0.10, "anger": -0.05}.get(label, 0.0)
     return np.array([pitch * rng.uniform(0.5, 1.5), 0, 0]) + 0.02 * rng.standard_normal(3)

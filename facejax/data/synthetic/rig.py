@@ -1,14 +1,14 @@
-"""A subject's face as a function of its expression units, on a ladder of realism.
+"""Facial rigs: a subject's vertices as a function of expression unit weights, at four levels of realism.
 
 Level 0   linear: neutral + weights @ units, the units averaged over ethnicities.
 Level 1   the subject's own mixture of the ethnic variants; units saturate; the jaw rotates about its hinge.
-Level 2   the units are carried to the subject's shape by deformation transfer; eyelids slide on the eyeball, lips
-          pass neither through one another nor through the teeth (`facejax.data.contact`).
-Level 3   skin wrinkles and bulges where it is compressed (`facejax.data.skin`).
+Level 2   the units are adapted to the subject's shape by deformation transfer; eyelids slide on the eyeball, lips do
+          not pass through one another or the teeth (`facejax.data.synthetic.contact`).
+Level 3   skin wrinkles and bulges where it is compressed (`facejax.data.synthetic.skin`).
 
-Every level is a function of the weights and the subject alone: nothing is random per frame.
+Every level is deterministic given the weights and the subject.
 
-Shapes: T frames, U units, N skin vertices, M = N + props' vertices. Millimetres.
+T frames, U units, N skin vertices, M = N + vertices of the props. Millimetres.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from facejax.mesh import deformation_transfer
 
 LEVELS = (0, 1, 2, 3)
 SATURATION = 0.35  # f(w) = (1 + k) w / (1 + k |w|): f(1) = 1, f(0.5) = 0.57
-JAW_LANDMARKS = (0, 16)  # beside the ears: the hinge lies behind them
+JAW_LANDMARKS = (0, 16)  # beside the ears; the hinge lies behind them
 HINGE_OFFSET = np.array([0.0, -8.0, -8.0])
-ANCHOR = 1e-7  # weight of "stay at the plain offset" in deformation transfer, against the gradient term
+ANCHOR = 1e-7  # weight of the untransferred offsets in deformation transfer, relative to the gradient term
 
 
 class Rig(NamedTuple):
-    """One subject at one level of realism; `pose` moves it."""
+    """The rig of one subject at one level of realism, for `pose`."""
 
     level: int
     neutral: np.ndarray  # (M, 3)
-    units: np.ndarray  # (U, M, 3) offsets at weight 1; the jaw's row holds what its rotation leaves over
-    hinge: np.ndarray  # (3,) a point of the jaw's axis, which is parallel to x
+    units: np.ndarray  # (U, M, 3) offsets at weight 1; the row of jawOpen is the residual of its rotation
+    hinge: np.ndarray  # (3,) point on the jaw's axis, which is parallel to x
     jaw_angle: np.ndarray  # (M,) radians at weight 1
     contact: contact.Contact | None  # levels 2 and 3
     skin: skin.Skin | None  # level 3
@@ -42,7 +42,7 @@ class Rig(NamedTuple):
 
 @functools.cache
 def unit_names() -> tuple[str, ...]:
-    """The U units: ARKit's 51 that move skin, then MakeHuman's 34."""
+    """Return the names of the U units: ARKit's 51 that move skin, then MakeHuman's 34."""
     names = list(assets.load().targets)
     arkit = [n.split("/")[1] for n in names if n.startswith("arkit/") and n != "arkit/tongueOut"]
     human = [n.split("/")[2] for n in names if n.startswith("unit/caucasian/")]
@@ -50,7 +50,7 @@ def unit_names() -> tuple[str, ...]:
 
 
 def build(subject: makehuman.Subject, *, level: int = 3) -> Rig:
-    """The rig of a subject. Raises `ValueError` for a level that is not 0 to 3."""
+    """Build the rig of a subject. Raises `ValueError` for a level other than 0 to 3."""
     if level not in LEVELS:
         raise ValueError(f"realism level must be one of {LEVELS}, got {level}")
     loaded = assets.load()
@@ -76,7 +76,11 @@ def build(subject: makehuman.Subject, *, level: int = 3) -> Rig:
 
 
 def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
-    """Unit weights (T, U) -> vertices (T, M, 3) float32, skin first, then the props."""
+    """Pose a rig by unit weights (T, U). Raises `ValueError` for another shape.
+
+    Returns:
+      Vertices (T, M, 3) float32, skin first, then the props.
+    """
     weights = np.asarray(weights, np.float32)
     count, vertices, _ = rig.units.shape
     if weights.ndim != 2 or weights.shape[1] != count:
@@ -86,7 +90,7 @@ def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
     if rig.contact is not None:
         moved = contact.clear_teeth(rig.contact, moved)
     if rig.level >= 1:
-        # The jaw opens by angle, in proportion to the unsaturated weight: its path is an arc, not a chord.
+        # The jaw's angle is proportional to the unsaturated weight, so that vertices move on arcs.
         moved = _rotate_jaw(rig, moved, weights[:, unit_names().index("jawOpen")])
     if rig.contact is not None:
         moved = contact.separate_lips(rig.contact, contact.slide_lids(rig.contact, moved))
@@ -96,7 +100,7 @@ def pose(rig: Rig, weights: np.ndarray) -> np.ndarray:
 
 
 def saturate(weights: np.ndarray) -> np.ndarray:
-    """Muscle shortening has diminishing returns: f(w) = (1 + k) w / (1 + k |w|)."""
+    """Model the saturation of muscle contraction: f(w) = (1 + k) w / (1 + k |w|)."""
     return (1 + SATURATION) * weights / (1 + SATURATION * np.abs(weights))
 
 
@@ -113,16 +117,16 @@ def _units(ethnicity: np.ndarray) -> np.ndarray:
 
 
 def _split_jaw(neutral: np.ndarray, offset: np.ndarray, hinge: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opening as rotation about x by an angle per vertex (M,), and what remains (M, 3), linear in the weight.
+    """Split the opening of the jaw into a rotation about x by an angle per vertex (M,) and a residual (M, 3).
 
-    The remainder rides along with the rotation, so it is given in the frame before it.
+    The residual is linear in the weight, and is added before the rotation.
     """
     before = neutral - hinge
     after = before + offset
     cross = before[:, 1] * after[:, 2] - before[:, 2] * after[:, 1]
     dot = before[:, 1] * after[:, 1] + before[:, 2] * after[:, 2]
     angle = np.where(np.linalg.norm(offset, axis=1) > 0, np.arctan2(cross, dot), 0.0)
-    # Close to the hinge a tiny offset can mean any angle: let its share fade out within 25 mm.
+    # Near the hinge the angle is ill-conditioned: fade it out within 25 mm.
     angle *= np.clip(np.linalg.norm(before[:, 1:], axis=1) / 25.0, 0, 1) ** 2
     return angle, _rotate_x(after, -angle) - before
 
@@ -134,15 +138,15 @@ def _rotate_x(points: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _rotate_jaw(rig: Rig, moved: np.ndarray, opening: np.ndarray) -> np.ndarray:
-    """Turn every vertex about the hinge, with whatever the other units did to it riding along."""
+    """Rotate vertices, as moved by the other units, about the hinge."""
     return rig.hinge + _rotate_x(moved - rig.hinge, opening[:, None] * rig.jaw_angle)
 
 
 def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """Carry the units' deformation gradients from the template to the subject (Sumner and Popovic 2004, linear form).
+    """Transfer the units' deformation gradients from the template to the subject (Sumner and Popovic 2004, linear).
 
-    For each coordinate of each unit: the surface gradient on the template, projected to the subject's triangles,
-    integrated by a Poisson solve. The scalp and neck, which no unit moves, anchor it.
+    For each coordinate of each unit, the surface gradient on the template is projected to the subject's triangles and
+    integrated by a Poisson solve. The scalp and neck, which no unit moves, are held fixed.
     """
     loaded = assets.load()
     n = loaded.skin
@@ -150,6 +154,6 @@ def _transfer(units: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     transfer = deformation_transfer.DeformationTransfer(
         makehuman.template().vertices, neutral[:n], loaded.faces, np.where(still, 1.0, ANCHOR)
     )
-    carried = units.copy()
-    carried[:, :n] = transfer(units[:, :n])
-    return carried
+    transferred = units.copy()
+    transferred[:, :n] = transfer(units[:, :n])
+    return transferred

@@ -1,11 +1,12 @@
-"""What skin does where the face compresses it: furrows across the compression, and bulges of the flesh.
+"""Wrinkles and bulges of compressed skin.
 
-A furrow group has, on the template, a mask, a coordinate s (millimetres across its furrows) and a profile: a wave
-for foreheads and crow's feet, a single fold for the nasolabial line. On a posed face the stretch along the gradient
-of s is measured triangle by triangle; where it is below 1 the profile is pushed out along the normal, deeper with
-age. Bulges follow the loss of area. Both depend on the face, its age and its pose alone, and vanish at rest.
+A group of furrows has, on the template, a mask, a coordinate s (millimetres across its furrows) and a profile: a wave
+for the forehead and crow's feet, a single fold for the nasolabial line. On a posed face, the stretch along the gradient
+of s is measured per triangle; where it is below 1, the profile is added along the normal, deeper with age. Bulges
+depend on the loss of area. Both depend only on the face, its age and its pose, and are zero at rest.
 
-Wavelengths follow the mesh: three edges at least (8 mm on the forehead, 3 mm about the eyes).
+Wavelengths are limited by the mesh to three edges or more (edges are 8 mm on the forehead, 3 mm around the eyes).
+N vertices, F triangles, M = N + vertices of the props, T frames.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from facejax.data.synthetic import assets, makehuman
 from facejax.geometry.interpolation import smoothstep
 
 YOUNG, OLD = 20.0, 80.0
-SLACK = 0.03  # compression that skin takes up before it folds
+SLACK = 0.03  # compression at which wrinkles begin
 STIFFNESS = 7.0  # tanh(STIFFNESS x compression): three quarters of the depth at 14 %
-BULGE_SMOOTHING = 3  # rounds of averaging of the area loss over neighbours
+BULGE_SMOOTHING = 3  # iterations of averaging the area loss over neighbours
 
 
 class Furrow(NamedTuple):
@@ -30,35 +31,35 @@ class Furrow(NamedTuple):
 
     mask: np.ndarray  # (N,) 0..1
     across: np.ndarray  # (N,) millimetres
-    wavelength: float  # 0 for a single fold at across = 0
+    wavelength: float  # millimetres; 0 for a single fold at across = 0
     depth: tuple[float, float]  # millimetres at 20 and at 80 years
 
 
 class Pattern(NamedTuple):
-    """The template's furrows and flesh, with each triangle given to the group that is strongest there."""
+    """The furrows and bulges of the template; each triangle belongs to the group with the largest mask."""
 
     furrows: tuple[Furrow, ...]
-    owner: np.ndarray  # (F,) group of a triangle
+    owner: np.ndarray  # (F,) group of each triangle
     flesh: np.ndarray  # (N,) millimetres of bulge at full compression
-    to_vertices: sparse.csr_matrix  # (N, F) mean over a vertex's triangles
-    smooth: sparse.csr_matrix  # (N, N) mean over a vertex and its neighbours
+    to_vertices: sparse.csr_matrix  # (N, F) averages over a vertex's triangles
+    smooth: sparse.csr_matrix  # (N, N) averages over a vertex and its neighbours
 
 
 class Skin(NamedTuple):
-    """A subject's skin."""
+    """The skin parameters of a subject."""
 
     rest_area: np.ndarray  # (F,)
-    along: np.ndarray  # (F, 2) unit direction across the furrows, in the triangle's two edge vectors
+    along: np.ndarray  # (F, 2) unit direction across the furrows, in the basis of the triangle's two edges
     height: np.ndarray  # (N,) signed millimetres of the furrows at full compression
     flesh: np.ndarray  # (N,)
 
 
 def build(subject: makehuman.Subject) -> Skin:
-    """Lay the template's pattern on a subject: its own phase, and its age's depth."""
+    """Compute a subject's skin: the template's pattern, with individual phases and a depth that depends on age."""
     faces, pattern = assets.load().faces, template_pattern()
     vertices = subject.vertices.astype(np.float64)
     age = np.clip((subject.age - YOUNG) / (OLD - YOUNG), 0, 1)
-    # The phase is a trait: drawn from the subject's own shape, so that the same face always folds alike.
+    # The phase is seeded by the subject's shape, so that the same face always wrinkles alike.
     rng = np.random.default_rng(np.frombuffer(subject.neutral.tobytes()[:64], np.uint32))
     height = np.zeros(len(vertices))
     for furrow in pattern.furrows:
@@ -73,7 +74,7 @@ def build(subject: makehuman.Subject) -> Skin:
 
 
 def add_wrinkles(skin: Skin, vertices: np.ndarray) -> np.ndarray:
-    """Posed vertices (T, M, 3) -> the same with furrows and bulges on the skin, (T, M, 3)."""
+    """Add wrinkles and bulges to the skin of posed vertices (T, M, 3)."""
     faces, pattern = assets.load().faces, template_pattern()
     n = len(skin.height)
     first, second = (vertices[:, faces[:, i]] - vertices[:, faces[:, 0]] for i in (1, 2))
@@ -94,7 +95,7 @@ def add_wrinkles(skin: Skin, vertices: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def template_pattern() -> Pattern:
-    """Furrows and flesh, placed by the template's landmarks."""
+    """Return furrows and bulges, placed by the template's landmarks."""
     shape = makehuman.template()
     v, mark = shape.vertices.astype(np.float64), shape.vertices[shape.landmarks].astype(np.float64)
     front = smoothstep(v[:, 2], -5, 15)
@@ -107,7 +108,12 @@ def template_pattern() -> Pattern:
 
     y, x = v[:, 1], v[:, 0]
     brow = middle(19, 24)[1]
-    forehead = smoothstep(y, brow + 2, brow + 14) * smoothstep(-y, -brow - 62, -brow - 42) * smoothstep(-np.abs(x), -56, -34) * front
+    forehead = (
+        smoothstep(y, brow + 2, brow + 14)
+        * smoothstep(-y, -brow - 62, -brow - 42)
+        * smoothstep(-np.abs(x), -56, -34)
+        * front
+    )
     furrows = [
         Furrow(forehead, y, 21.0, (0.25, 1.0)),
         Furrow(spot(middle(21, 22) + [0, 3, 0], 9), x, 14.0, (0.3, 1.1)),
@@ -128,9 +134,9 @@ def template_pattern() -> Pattern:
 
 
 def _nasolabial(v, start, end, side) -> tuple[np.ndarray, np.ndarray]:
-    """Signed distance from the line nose wing -> beside the mouth's corner (outward positive), and its mask."""
+    """Return the signed distance from the line nose wing -> mouth corner (outward positive), and its mask."""
     axis = (end - start)[:2]
-    length = np.linalg.norm(axis)
+    length = float(np.linalg.norm(axis))
     axis = axis / length
     offset = v[:, :2] - start[:2]
     along = offset @ axis
@@ -147,7 +153,7 @@ def _profile(furrow: Furrow, phase: float) -> np.ndarray:
 
 
 def _directions(vertices: np.ndarray, faces: np.ndarray, pattern: Pattern) -> np.ndarray:
-    """Per triangle, the unit direction in which its group's coordinate grows, in the basis of its two edges: (F, 2)."""
+    """Return the unit gradient of each triangle's group coordinate, in the basis of its two edges, (F, 2)."""
     across = np.stack([f.across for f in pattern.furrows])[pattern.owner[:, None], faces]
     first, second = (vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
     gram = np.stack(
@@ -163,7 +169,7 @@ def _directions(vertices: np.ndarray, faces: np.ndarray, pattern: Pattern) -> np
 
 
 def _response(compression: np.ndarray) -> np.ndarray:
-    """0 for stretched skin, smooth at the onset, saturating: values in 0..1."""
+    """Return the response to compression in 0..1: 0 for stretched skin, smooth at the onset, saturating."""
     folded = np.maximum(compression, 0.0)
     return np.tanh(STIFFNESS * folded * folded / (folded + SLACK))
 
@@ -172,14 +178,16 @@ def _averaging(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, sparse
     rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
     incidence = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, len(faces)))
     neighbours = ((incidence @ incidence.T) > 0).astype(float)
-    return (
-        (sparse.diags(1 / incidence.sum(axis=1).A1) @ incidence).tocsr().astype(np.float32),
-        (sparse.diags(1 / neighbours.sum(axis=1).A1) @ neighbours).tocsr().astype(np.float32),
-    )
+    return _normalise_rows(incidence), _normalise_rows(neighbours)
+
+
+def _normalise_rows(matrix: sparse.csr_matrix) -> sparse.csr_matrix:
+    scale = sparse.diags(1 / np.asarray(matrix.sum(axis=1)).ravel())
+    return sparse.csr_matrix(scale @ matrix, dtype=np.float32)
 
 
 def _average(matrix: sparse.csr_matrix, values: np.ndarray) -> np.ndarray:
-    """Apply a (A, B) operator to (T, B) -> (T, A)."""
+    """Apply an operator (A, B) to values (T, B): (T, A)."""
     return (matrix @ values.T).T
 
 

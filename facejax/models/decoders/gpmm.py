@@ -1,18 +1,21 @@
-"""A Gaussian process morphable model that is carried to each face: the best linear answer to a face's landmarks.
+"""Gaussian process morphable model (GPMM) transferred to each face: MAP vertex displacements given the landmarks.
 
-Displacements of a face are a Gaussian process on its surface: a mean, and a covariance that is the sum of what training
-faces showed and of a smooth prior (Luthi et al. 2018), which takes up what they never did: near points move alike, each
-as far as it usually moves. The most probable displacement given the landmarks', with noise of variance `noise`, is one
-affine map; it differs from face to face where the covariance was learnt on a mean face and is *carried* to the given
-one by deformation transfer (`facejax.mesh.transfer`). Plain, and without the smooth prior, it is ridge regression.
-Landmarks that are off, a detector's say, mislead it badly; it can be `with_landmark_noise` how far, or find out (`estimate_landmark_noise`).
+Displacements of a face are modelled as a Gaussian process on its surface: a mean, and a covariance that is the sum of
+the training statistics and of a smooth prior (Luthi et al. 2018). The smooth prior covers deformations that are absent
+from the training set: nearby vertices move alike, each in proportion to its usual motion. The posterior mean given
+landmark displacements with noise of variance `noise` is an affine map. It differs between faces if the model is
+*carried*: the covariance is learned on the mean face and transferred to each face by deformation transfer
+(`facejax.mesh.deformation_transfer`). Without transfer and without the smooth prior the model is ridge regression.
+Noisy landmarks, such as a detector's, degrade the estimate strongly; set their noise with `with_landmark_noise`, or
+estimate it with `estimate_landmark_noise`.
 
     params = gpmm.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
-    mine = gpmm.on_face(params, neutral)  # once per face, a fifth of a second
-    displacements = linear.apply(mine, landmark_displacements)
+    face_map = gpmm.linear_map(params, neutral)  # once per face, 0.2 s
+    displacements = linear.apply(face_map, landmark_displacements)
 
-On makehuman4d's level 3, validation people, training on 80: ridge regression errs by 0.0432 mm over the head, this by
-0.0205. Its expressions are themselves made by deformation transfer there, which favours it; levels 0 and 1 are not.
+On makehuman4d's level 3, validation people, training on 80: the mean vertex error over the head is 0.0432 mm for ridge
+regression and 0.0205 mm for this model. Expressions of that level are themselves made by deformation transfer, which
+favours the model; those of levels 0 and 1 are not.
 
 N vertices, F triangles, L landmarks, k components, T frames of a person; millimetres, on the host, in float64.
 """
@@ -23,17 +26,18 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from facejax.mesh import deformation_transfer
 from facejax.models.decoders import linear
 
 COMPONENTS = 400
-SMOOTH_SCALES_MM = (10.0, 20.0, 40.0, 80.0)  # mm, of the smooth prior: wrinkles of a cheek, a cheek, a jaw, a head
-NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # mm, of landmarks: a sixteenth from one to the next
+SMOOTH_SCALES_MM = (10.0, 20.0, 40.0, 80.0)  # of the smooth prior: wrinkles, cheek, jaw, head
+NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # steps of 6 %
 
 
 class Person(NamedTuple):
-    """One face and its frames: displacements from neutral."""
+    """One neutral face and T frames of displacements from it."""
 
     neutral: np.ndarray  # (N, 3)
     landmarks: np.ndarray  # (T, L, 3)
@@ -41,51 +45,65 @@ class Person(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """How strongly what is believed; found by cross-validation (`facejax.fit_gpmm`)."""
+    """Hyperparameters; chosen by cross-validation (`facejax.training.recipes.fit_gpmm`)."""
 
-    carried: bool = True
-    smooth: float = 0.003  # standard deviation of the smooth prior, over how far each vertex usually moves
-    noise: float = 1e-4  # variance of a landmark's coordinate, mm^2
+    carried: bool = True  # whether the learned covariance is transferred to each face
+    smooth: float = 0.003  # standard deviation of the smooth prior, in units of each vertex's `motion`
+    noise: float = 1e-4  # variance of a landmark coordinate, mm^2
 
 
 class GPMM(NamedTuple):
-    """The mean face, and what displacements look like on it."""
+    """The mean face and the statistics of displacements on it."""
 
     faces: np.ndarray  # (F, 3)
     landmark_index: np.ndarray  # (L,)
     face: np.ndarray  # (N, 3)
-    motion: np.ndarray  # (N,) how far each vertex moves, root mean square in mm: the smooth prior's measure
-    hold: np.ndarray  # (N,) the same, as the carrier between faces was given it
-    # Carried: a basis on the mean face. Plain: moments as they are, or the map itself, the same for all faces.
+    motion: np.ndarray  # (N,) root mean square displacement of each vertex in mm, which scales the smooth prior
+    hold: np.ndarray  # (N,) `motion` as used by the deformation transfer's anchors
+    # Carried: a basis on the mean face. Otherwise moments, or the map itself (from a file), the same for all faces.
     statistics: linear.Basis | linear.Moments | linear.LinearMap
     prior: Prior
 
 
 def fit(
     people: Iterable[Person],
-    faces: np.ndarray,
-    landmark_index: np.ndarray,
+    faces: Int[np.ndarray, "F 3"],
+    landmark_index: Int[np.ndarray, " L"],
     *,
     prior: Prior = Prior(),
     components: int = COMPONENTS,
     passes: int = 3,
 ) -> GPMM:
-    """Learn from people (any iterable that can be gone through several times)."""
+    """Fit the model to people, any iterable that can be iterated several times.
+
+    Args:
+      faces: (F, 3) triangles.
+      landmark_index: (L,) vertices.
+      components: of the basis, if `prior.carried`.
+      passes: of the subspace iteration.
+
+    Raises:
+      ValueError: no person with a frame.
+    """
     face, motion = mean_face_and_motion(people)
-    known = fit_statistics(
+    statistics = fit_statistics(
         [(p.landmarks, transfer_to(p, faces, face, motion) if prior.carried else p.vertices) for p in people],
         carried=prior.carried, components=components, passes=passes,
     )  # fmt: skip
-    return GPMM(faces, landmark_index, face, motion, motion, known, prior)
+    return GPMM(faces, landmark_index, face, motion, motion, statistics, prior)
 
 
 def mean_face_and_motion(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarray]:
-    """The mean face (N, 3), and how far its vertices move (N,), root mean square over all frames in mm."""
-    count, faces, frames, squares = 0, 0.0, 0, 0.0
+    """Return the mean face (N, 3), and the root mean square displacement of its vertices over all frames (N,), in mm.
+
+    Raises:
+      ValueError: no person with a frame.
+    """
+    count, faces, frames, squares = 0, np.zeros(()), 0, np.zeros(())
     for person in people:
         count, faces = count + 1, faces + np.asarray(person.neutral, np.float64)
         frames += len(person.vertices)
-        squares += np.sum(np.square(person.vertices, dtype=np.float64), axis=(0, 2))
+        squares = squares + np.sum(np.square(person.vertices, dtype=np.float64), axis=(0, 2))
     if not frames:
         raise ValueError("expected at least one person with a frame, got none")
     return faces / count, np.sqrt(squares / frames)
@@ -94,121 +112,151 @@ def mean_face_and_motion(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarr
 def fit_statistics(
     batches: linear.Batches, *, carried: bool, components: int = COMPONENTS, passes: int = 3
 ) -> linear.Basis | linear.Moments:
-    """The statistics of displacements: a basis of what was carried to the mean face, or moments of what was not."""
+    """Fit the statistics of displacements: a PCA basis if they were transferred to the mean face, else moments."""
     return (
         linear.pca.prepare(batches, components=components, passes=passes) if carried else linear.ridge.prepare(batches)
     )
 
 
-def transfer_to(person: Person, faces: np.ndarray, face: np.ndarray, regulariser: np.ndarray) -> np.ndarray:
-    """A person's displacements on another face, (T, N, 3) float32."""
-    anchors = deformation_transfer.anchor_weights(regulariser)
+def transfer_to(
+    person: Person,
+    faces: Int[np.ndarray, "F 3"],
+    face: Float[np.ndarray, "N 3"],
+    motion: Float[np.ndarray, " N"],
+) -> Float[np.ndarray, "T N 3"]:
+    """Transfer a person's displacements to another face, in float32; `motion` as in `GPMM`."""
+    anchors = deformation_transfer.anchor_weights(motion)
     there = deformation_transfer.DeformationTransfer(person.neutral, face, faces, anchors)
     back = deformation_transfer.DeformationTransfer(face, person.neutral, faces, anchors)
     return deformation_transfer.invert(there, back, person.vertices).astype(np.float32)
 
 
 def with_landmark_noise(params: GPMM, noise: float) -> GPMM:
-    """The model that knows landmarks to be off by so many mm in every coordinate, as a detector's are.
+    """Return the model with landmark noise sigma (mm) per coordinate, added to the prior's noise.
 
-    Raises `ValueError` for noise below 0, and for a model of which only the map was kept.
+    Raises:
+      ValueError: negative noise, or a model that holds only the linear map.
     """
     if not noise >= 0:
         raise ValueError(f"noise: expected 0 mm or more, got {noise}")
     if noise and isinstance(params.statistics, linear.LinearMap):
-        raise ValueError("noise: this model was kept as one map, which was made for landmarks that are right")
+        raise ValueError(
+            "noise: this model file stores only a linear map fitted to noise-free landmarks; expected noise 0"
+        )
     return params._replace(prior=params.prior._replace(noise=params.prior.noise + noise**2))
 
 
-def estimate_landmark_noise(params: GPMM, neutral: np.ndarray, landmarks: np.ndarray) -> float:
-    """How far landmark displacements (T, L, 3) of one face (N, 3) are off, by the model: mm in every coordinate.
+def estimate_landmark_noise(
+    params: GPMM, neutral: Float[Array | np.ndarray, "N 3"], landmarks: Float[Array | np.ndarray, "T L 3"]
+) -> float:
+    """Estimate the noise of one face's landmark displacements: sigma in mm per coordinate.
 
-    The noise under which they are most likely (type II maximum likelihood): what no face does is noise. One number for
-    all frames, of `NOISE_GRID_MM`, 5 mm at most. Raises `ValueError` as `linear_map` and `with_landmark_noise` do, for no frames, and for
-    landmarks that are not finite.
+    The value of `NOISE_GRID_MM` (at most 5 mm) that maximises the marginal likelihood of all frames (type II maximum
+    likelihood).
+
+    Raises:
+      ValueError: no frames, values that are not finite, or errors of `linear_map` and `with_landmark_noise`.
     """
     if len(landmarks) == 0 or not np.isfinite(landmarks).all():
         raise ValueError(f"landmarks: expected one or more frames of finite numbers, got {np.shape(landmarks)}")
     if isinstance(params.statistics, linear.LinearMap):
-        raise ValueError("noise: this model was kept as one map, which cannot tell what faces do not do")
+        raise ValueError(
+            "noise: this model file stores only a linear map, without the statistics to estimate landmark noise from"
+        )
     known = covariances(params, neutral, vertex_index=np.zeros(0, int))
-    here, _ = _posterior(known, params.prior)
-    variance, directions = np.linalg.eigh(here)
-    off = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
-    seen = np.mean(np.square(off @ directions), axis=0)
-    whole = np.maximum(variance, params.prior.noise) + np.square(NOISE_GRID_MM)[:, None]
-    likelihood = -np.sum(np.log(whole) + seen / whole, axis=1)
+    variance, directions = np.linalg.eigh(_posterior(known, params.prior)[0])
+    centred = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
+    observed = np.mean(np.square(centred @ directions), axis=0)
+    expected = np.maximum(variance, params.prior.noise) + np.square(NOISE_GRID_MM)[:, None]
+    likelihood = -np.sum(np.log(expected) + observed / expected, axis=1)
     return float(NOISE_GRID_MM[np.argmax(likelihood)])
 
 
-def linear_map(params: GPMM, neutral: np.ndarray) -> linear.LinearMap:
-    """The map of one face (N, 3): what `linear.apply` takes. Raises `ValueError` for a face of another shape."""
+def linear_map(params: GPMM, neutral: Float[Array | np.ndarray, "N 3"]) -> linear.LinearMap:
+    """Return the affine map of one face, for `linear.apply`.
+
+    Raises:
+      ValueError: a face of another shape.
+    """
     if isinstance(params.statistics, linear.LinearMap):
         _check(params, neutral)
         return params.statistics
-    here, there = _posterior(known := covariances(params, neutral), params.prior)
-    return linear.affine(known.mean[params.landmark_index], known.mean, np.linalg.solve(here, there))
+    within, cross = _posterior(known := covariances(params, neutral), params.prior)
+    return linear.affine(known.mean[params.landmark_index], known.mean, np.linalg.solve(within, cross))
 
 
 class Covariances(NamedTuple):
-    """What is believed of V vertices of one face, before the prior's weights; 3 L and 3 V coordinates."""
+    """Covariances of V vertices and the landmarks of one face, before the prior's weights are applied."""
 
     mean: np.ndarray  # (V, 3)
     landmark_mean: np.ndarray  # (L, 3)
-    within: np.ndarray  # (3 L, 3 L) learnt, of the landmarks among themselves
-    cross: np.ndarray  # (3 L, 3 V) learnt, of landmarks and vertices
-    smooth_within: np.ndarray  # (3 L, 3 L) of the smooth prior at standard deviations of one motion
+    within: np.ndarray  # (3 L, 3 L) learned, between landmarks
+    cross: np.ndarray  # (3 L, 3 V) learned, between landmarks and vertices
+    smooth_within: np.ndarray  # (3 L, 3 L) of the smooth prior with unit `smooth`
     smooth_cross: np.ndarray  # (3 L, 3 V)
 
 
-def covariances(params: GPMM, neutral: np.ndarray, *, vertex_index: np.ndarray | None = None) -> Covariances:
-    """Of one face (N, 3): all vertices, or `vertex_index` (V,). Raises `ValueError` for a face of another shape."""
+def covariances(
+    params: GPMM, neutral: Float[Array | np.ndarray, "N 3"], *, vertex_index: Int[np.ndarray, " V"] | None = None
+) -> Covariances:
+    """Return the covariances of one face's landmarks with all vertices, or with those of `vertex_index`.
+
+    Raises:
+      ValueError: a face of another shape.
+    """
     _check(params, neutral)
     at = params.landmark_index
-    keep = np.arange(len(params.face)) if vertex_index is None else vertex_index
-    mean, within, cross = _learnt(params, neutral, keep)
+    index = np.arange(len(params.face)) if vertex_index is None else vertex_index
+    mean, within, cross = _learned(params, neutral, index)
     smooth = _smooth(params)
-    spread = [np.kron(smooth[:, some], np.eye(3)) for some in (at, keep)]
-    return Covariances(mean[keep], mean[at], within, cross, *spread)
+    smooth_within, smooth_cross = (np.kron(smooth[:, columns], np.eye(3)) for columns in (at, index))
+    return Covariances(mean[index], mean[at], within, cross, smooth_within, smooth_cross)
 
 
-def predict(known: Covariances, prior: Prior, landmarks: np.ndarray) -> np.ndarray:
-    """Displacements (T, V, 3) of landmarks' (T, L, 3): for a few frames cheaper than a map."""
-    here, there = _posterior(known, prior)
-    off = (landmarks - known.landmark_mean).reshape(len(landmarks), -1)
-    return known.mean + (np.linalg.solve(here, off.T).T @ there).reshape(len(landmarks), -1, 3)
+def predict(known: Covariances, prior: Prior, landmarks: Float[Array | np.ndarray, "T L 3"]) -> np.ndarray:
+    """Return the displacements (T, V, 3) given the landmarks'; for a few frames cheaper than `linear_map`."""
+    within, cross = _posterior(known, prior)
+    centred = np.asarray(landmarks - known.landmark_mean).reshape(len(landmarks), -1)
+    return known.mean + (np.linalg.solve(within, centred.T).T @ cross).reshape(len(landmarks), -1, 3)
 
 
-def _check(params: GPMM, neutral: np.ndarray) -> None:
+def _check(params: GPMM, neutral: Array | np.ndarray) -> None:
     if np.shape(neutral) != params.face.shape:
         raise ValueError(f"neutral: expected vertices {params.face.shape}, got {np.shape(neutral)}")
 
 
 def _posterior(known: Covariances, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
-    far = prior.smooth**2
-    here = known.within + far * known.smooth_within + prior.noise * np.eye(len(known.within))
-    return here, known.cross + far * known.smooth_cross
+    """Return the landmarks' covariance with noise, and that of landmarks and vertices, under a prior."""
+    weight = prior.smooth**2
+    within = known.within + weight * known.smooth_within + prior.noise * np.eye(len(known.within))
+    return within, known.cross + weight * known.smooth_cross
 
 
-def _learnt(params: GPMM, neutral: np.ndarray, keep: np.ndarray):
-    """On this face: the mean (N, 3), the landmarks' covariance among themselves, and with the kept vertices."""
-    known, at = params.statistics, params.landmark_index
-    if isinstance(known, linear.Moments):
-        cross = known.cross.reshape(len(known.cross), -1, 3)[:, keep].reshape(len(known.cross), -1)
-        return known.vertex_mean, known.covariance, cross
+def _learned(
+    params: GPMM, neutral: Array | np.ndarray, vertex_index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, on this face, the mean (N, 3), the covariance between landmarks, and that with the chosen vertices."""
+    statistics, at = params.statistics, params.landmark_index
+    if isinstance(statistics, linear.Moments):
+        cross = statistics.cross.reshape(len(statistics.cross), -1, 3)[:, vertex_index]
+        return statistics.vertex_mean, statistics.covariance, cross.reshape(len(cross), -1)
+    if isinstance(statistics, linear.LinearMap):
+        raise ValueError("this model file stores only a linear map, without covariances")
     anchors = deformation_transfer.anchor_weights(params.hold)
-    carrier = deformation_transfer.DeformationTransfer(params.face, neutral, params.faces, anchors)
-    shape = (len(known.components), *params.face.shape)
-    moved = carrier(np.concatenate([known.vertex_mean[None], known.components.reshape(shape)]))
+    transfer = deformation_transfer.DeformationTransfer(params.face, np.asarray(neutral), params.faces, anchors)
+    components = statistics.components.reshape(-1, *params.face.shape)
+    moved = transfer(np.concatenate([statistics.vertex_mean[None], components]))
     mean, moved = moved[0], moved[1:]
     marks = moved[:, at].reshape(len(moved), -1)
-    weighted = known.variance[:, None] * marks
-    return mean, weighted.T @ marks, weighted.T @ moved[:, keep].reshape(len(moved), -1)
+    weighted = statistics.variance[:, None] * marks
+    return mean, weighted.T @ marks, weighted.T @ moved[:, vertex_index].reshape(len(moved), -1)
 
 
 def _smooth(params: GPMM) -> np.ndarray:
-    """The smooth prior's covariance of landmarks and vertices, (L, N), for a standard deviation of one motion."""
+    """Return the smooth prior's covariance of landmarks and vertices, (L, N), for a standard deviation of `motion`."""
     at = params.landmark_index
     squared = np.sum((params.face[at, None] - params.face) ** 2, axis=-1)
-    alike = sum(np.exp(-squared / (2 * scale**2)) for scale in SMOOTH_SCALES_MM) / len(SMOOTH_SCALES_MM)
-    return alike * params.motion[at, None] * params.motion
+    kernel = np.zeros_like(squared)
+    for scale in SMOOTH_SCALES_MM:
+        kernel = kernel + np.exp(-squared / (2 * scale**2))
+    return kernel / len(SMOOTH_SCALES_MM) * params.motion[at, None] * params.motion

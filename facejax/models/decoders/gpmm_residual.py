@@ -1,9 +1,11 @@
-"""From the landmarks of one face to its mesh: the best linear answer, refined by a spiral decoder.
+"""GPMM estimate plus residual decoder: from the landmarks of one face to its mesh.
 
-    vertices = neutral + expand.apply(params, landmark_displacements, neutral)
+    vertices = neutral + gpmm_residual.apply(params, landmark_displacements, neutral)
 
-What the linear answer has to know of a face is worked out once, on the host, and remembered for the last few faces:
-a fifth of a second each. `pack` and `unpack` are for files. N vertices, L landmarks, k components; millimetres.
+The linear map of a face is computed once on the host (0.2 s) and cached for the last few faces. `pack` and `unpack`
+convert the parameters for files.
+
+N vertices, L landmarks, B samples, k components; millimetres.
 """
 
 from __future__ import annotations
@@ -17,19 +19,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from facejax.mesh import strain
 from facejax.mesh.hierarchy import Hierarchy
 from facejax.models.decoders import gpmm, linear, residual
 
 BATCH = 16
-CACHE_SIZE = 8  # remembered
-# What was asked for last: the model and its map of a face, by the model's identity, the face's bytes and the noise.
+CACHE_SIZE = 8  # faces whose linear map is kept
+# Model and linear map of a face, by the model's identity, the face's digest and the noise; least recently used first.
 _cache: OrderedDict[tuple[int, str, float], tuple[gpmm.GPMM, linear.LinearMap]] = OrderedDict()
 
 
 class GPMMResidual(NamedTuple):
-    """The linear answer, the network that refines it, and the tables that it works on."""
+    """The GPMM, the residual decoder, and the index tables of the mesh."""
 
     base: gpmm.GPMM
     network: residual.ResidualDecoder
@@ -39,26 +42,26 @@ class GPMMResidual(NamedTuple):
 
 def apply(
     params: GPMMResidual,
-    displacements: jax.Array,
-    neutral: np.ndarray,
+    displacements: Float[Array | np.ndarray, "... L 3"],
+    neutral: Float[Array | np.ndarray, "N 3"],
     *,
     refined: bool = True,
     noise: float | None = 0.0,
-) -> jax.Array:
-    """Vertex displacements (..., N, 3) of one face (N, 3) from its landmarks' (..., L, 3).
+) -> Float[Array, "... N 3"]:
+    """Return vertex displacements of one face from its landmark displacements.
 
-    Without `refined` the linear answer alone, which is one product of matrices. `noise` tells by how many mm the
-    landmarks are off in every coordinate, such as those of a detector; None finds it out from the frames given
-    (`gpmm.estimate_landmark_noise`). The linear answer takes it into account, and goes unrefined, since the network has learnt from
-    landmarks that are right.
+    Args:
+      refined: add the residual decoder's output; without it the GPMM estimate alone, one matrix product.
+      noise: landmark noise sigma (mm) per coordinate, such as a detector's; None estimates it from the frames
+        (`gpmm.estimate_landmark_noise`). With noise the GPMM estimate is returned without the residual decoder, which
+        was trained on noise-free landmarks.
 
-    Raises `ValueError` for other shapes, for a face that is traced (each is prepared on the host), and for `noise`
-    where the linear answer was kept as one map for all faces (`pack`).
+    Raises:
+      ValueError: wrong shapes, a traced `neutral` (it is preprocessed on the host), or `noise` for a model that stores
+        only a linear map (see `pack`).
     """
     if isinstance(neutral, jax.core.Tracer):
-        raise ValueError(
-            "neutral: every face is prepared on the host, so that it cannot be traced: leave it out of jit"
-        )
+        raise ValueError("neutral: every face is prepared on the host and cannot be traced: pass it as a constant")
     neutral = np.asarray(neutral)
     if noise is None:
         marks = np.asarray(displacements)
@@ -73,11 +76,11 @@ def apply(
     return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
 
 
-def cached_linear_map(base: gpmm.GPMM, neutral: np.ndarray, noise: float = 0.0) -> linear.LinearMap:
-    """`gpmm.linear_map` of a model that is `gpmm.with_landmark_noise` of landmark noise in mm, remembered."""
+def cached_linear_map(base: gpmm.GPMM, neutral: Float[np.ndarray, "N 3"], noise: float = 0.0) -> linear.LinearMap:
+    """Return `gpmm.linear_map` of the model with landmark noise sigma (mm), cached for the last `CACHE_SIZE` faces."""
     key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest(), noise
     if key not in _cache:
-        # The model is kept with its answer: no other can then have its identity.
+        # The model is kept with its map, so that its id cannot be reused by another model.
         _cache[key] = base, gpmm.linear_map(gpmm.with_landmark_noise(base, noise), neutral)
         while len(_cache) > CACHE_SIZE:
             _cache.popitem(last=False)
@@ -85,16 +88,28 @@ def cached_linear_map(base: gpmm.GPMM, neutral: np.ndarray, noise: float = 0.0) 
     return _cache[key][1]
 
 
-def refine(params: GPMMResidual, displacements: jax.Array, base: jax.Array, neutral: jax.Array) -> jax.Array:
-    """The base's answers (B, N, 3) to landmarks (B, L, 3) of faces (B, N, 3), refined."""
+def refine(
+    params: GPMMResidual,
+    displacements: Float[Array | np.ndarray, "B L 3"],
+    base: Float[Array | np.ndarray, "B N 3"],
+    neutral: Float[Array | np.ndarray, "B N 3"],
+) -> Float[Array | np.ndarray, "B N 3"]:
+    """Add the residual decoder's output to the GPMM estimates `base` of landmark displacements of neutral faces."""
     if len(base) == 0 or float(params.network.gate) == 0:
         return base
     return _refine(params.network, params.hierarchy, params.tables, displacements, base, neutral)
 
 
 @jax.jit
-def _refine(network, hierarchy, tables, displacements, base, neutral):
-    """In equal pieces of at most 16, one after another, so that temporary arrays stay small."""
+def _refine(
+    network: residual.ResidualDecoder,
+    hierarchy: Hierarchy,
+    tables: strain.VertexTriangles,
+    displacements: Array,
+    base: Array,
+    neutral: Array,
+) -> Array:
+    """Refine equal pieces of at most 16 samples, one after another, so that temporary arrays stay small."""
     count = len(base)
     pieces = -(-count // BATCH)
     size = -(-count // pieces)
@@ -102,55 +117,59 @@ def _refine(network, hierarchy, tables, displacements, base, neutral):
         jnp.pad(x, ((0, pieces * size - count), (0, 0), (0, 0)), mode="edge").reshape(pieces, size, *x.shape[1:])
         for x in (displacements, base, neutral)
     ]
-    found = jax.lax.map(lambda part: residual.apply(network, hierarchy, tables, *part), tuple(parts))
-    return found.reshape(-1, *found.shape[2:])[:count]
+    out = jax.lax.map(lambda part: residual.apply(network, hierarchy, tables, *part), tuple(parts))
+    return out.reshape(-1, *out.shape[2:])[:count]
 
 
 def pack(params: GPMMResidual, *, components: int | None = None) -> dict[str, Any]:
-    """A tree of arrays for a file.
+    """Return a tree of arrays for a file.
 
-    Of a carried model the widest `components`, in half precision, an error of some 0.0005 mm. Of a plain one the map
-    itself, which is the same for all faces: moments that were rounded would be solved for with the noise's weight, and
-    cost 0.2 mm where a model of exactly linear data errs by 1e-6.
+    A carried model is stored as its leading `components` in half precision, an error of about 0.0005 mm. A plain one is
+    stored as its linear map, which is the same for all faces: solving with rounded moments would amplify the rounding
+    and cost 0.2 mm on exactly linear data, where the error of the model is 1e-6 mm.
     """
     base = params.base
-    tree = {name: np.asarray(getattr(base, name), np.float32) for name in ("face", "motion", "hold")}
+    tree: dict[str, Any] = {name: np.asarray(getattr(base, name), np.float32) for name in ("face", "motion", "hold")}
     tree |= {"landmark_index": np.asarray(base.landmark_index, np.int32), "prior": np.array(base.prior, np.float64)}
-    known = base.statistics
-    if isinstance(known, linear.Basis):
-        some = slice(components)
-        tree["mean"] = np.asarray(known.vertex_mean, np.float32)
-        tree["components"] = np.asarray(known.components[some], np.float16)
-        tree["variance"] = np.asarray(known.variance[some], np.float32)
+    statistics = base.statistics
+    if isinstance(statistics, linear.Basis):
+        leading = slice(components)
+        tree["mean"] = np.asarray(statistics.vertex_mean, np.float32)
+        tree["components"] = np.asarray(statistics.components[leading], np.float16)
+        tree["variance"] = np.asarray(statistics.variance[leading], np.float32)
     else:
-        found = gpmm.linear_map(base, base.face)
-        (tree["map"],) = found.factors
-        tree |= {"mean": found.vertex_mean, "landmark_mean": found.landmark_mean}
+        face_map = gpmm.linear_map(base, base.face)
+        (tree["map"],) = face_map.factors
+        tree |= {"mean": face_map.vertex_mean, "landmark_mean": face_map.landmark_mean}
     return {"base": tree, "network": params.network._asdict()}
 
 
-def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: np.ndarray) -> GPMMResidual:
-    """What `pack` was given, on the triangles (F, 3). Raises `KeyError` for a tree that is none of its own."""
+def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: Int[np.ndarray, "F 3"]) -> GPMMResidual:
+    """Return the parameters that `pack` was given, on the triangles (F, 3).
+
+    Raises:
+      KeyError: a tree that `pack` did not write.
+    """
     base = dict(tree["base"])
     at, prior = np.asarray(base["landmark_index"]), np.asarray(base["prior"])
-    wide = functools.partial(np.asarray, dtype=np.float64)
+    as_float64 = functools.partial(np.asarray, dtype=np.float64)
     if "components" in base:
-        components = wide(base["components"])
+        components = as_float64(base["components"])
         marks = components.reshape(len(components), -1, 3)[:, at].reshape(len(components), -1)
-        mean = wide(base["mean"])
-        variance = wide(base["variance"])
-        known = linear.Basis(mean[at], mean, components, marks, variance, float(variance.sum()))
+        mean = as_float64(base["mean"])
+        variance = as_float64(base["variance"])
+        statistics = linear.Basis(mean[at], mean, components, marks, variance, float(variance.sum()))
     else:
-        known = linear.affine(base["landmark_mean"], base["mean"], base["map"])
+        statistics = linear.affine(base["landmark_mean"], base["mean"], base["map"])
     prior = gpmm.Prior(bool(prior[0]), float(prior[1]), float(prior[2]))
-    face, motion, hold = (wide(base[name]) for name in ("face", "motion", "hold"))
+    face, motion, hold = (as_float64(base[name]) for name in ("face", "motion", "hold"))
     faces = np.asarray(faces)
-    found = gpmm.GPMM(faces, at, face, motion, hold, known, prior)
-    # As `pack` leaves it, or all names, as a file does.
+    model = gpmm.GPMM(faces, at, face, motion, hold, statistics, prior)
+    # A record, as `pack` returns it, or a dict, as read from a file.
     scale, network = tree["network"]["scale"], tree["network"]
     scale = residual.Scale(**scale) if isinstance(scale, dict) else scale
     return GPMMResidual(
-        found,
+        model,
         jax.tree.map(jnp.asarray, residual.ResidualDecoder(scale, network["weights"], network["gate"])),
         jax.device_put(hierarchy),
         jax.device_put(strain.vertex_triangles(faces, len(face))),

@@ -45,7 +45,7 @@ class Neural3DMM(NamedTuple):
 
 
 def downsampling_spirals(hierarchy: Hierarchy) -> tuple[Stencil, ...]:
-    """Return stencils that convolve and downsample, from fine to coarse: spirals of the vertices kept by the next level."""
+    """Return stencils that convolve and downsample, from fine to coarse: spirals at vertices kept by the next level."""
     found: list[Stencil] = []
     for level, spirals in enumerate(hierarchy.spirals):
         within = np.searchsorted(np.sort(hierarchy.kept[level]), hierarchy.kept[level + 1])
@@ -72,39 +72,37 @@ def init(
     Raises:
       ValueError: `encoder` or `channels` does not match the number of levels.
     """
-    INIT_BODY
-def init(
-    key: Array,
-    hierarchy: Hierarchy,
-    scale: Scale,
-    *,
-    encoder: Sequence[int] = ENCODER,
-    channels: Sequence[int] = s2d_dec.CHANNELS,
-) -> Neural3DMM:
-    """Random weights. Raises `ValueError` where the numbers of levels do not fit."""
     if len(encoder) != len(hierarchy.climbs):
         raise ValueError(f"encoder: expected {len(hierarchy.climbs)} channels for this hierarchy, got {len(encoder)}")
-    decode_key, latent_key, *keys = jax.random.split(key, 2 + len(encoder))
-    he = jax.nn.initializers.he_normal(in_axis=(0, 1), out_axis=2)
+    decode_key, latent_key, *conv_keys = jax.random.split(key, 2 + len(encoder))
     convs = [
-        {"kernel": he(k, (len(climb.source), inward, outward)), "bias": jnp.zeros(outward)}
-        for k, climb, inward, outward in zip(keys, hierarchy.climbs, (3, *encoder[:-1]), encoder, strict=True)
+        layers.init_spiral_conv(conv_key, len(stencil.source), width_in, width_out)
+        for conv_key, stencil, width_in, width_out in zip(
+            conv_keys, hierarchy.climbs, (3, *encoder[:-1]), encoder, strict=True
+        )
     ]
     coarse = hierarchy.sizes[-1] * encoder[-1]
-    latent = {"kernel": jax.nn.initializers.glorot_normal()(latent_key, (coarse, LATENT)), "bias": jnp.zeros(LATENT)}
-    decode = s2d_dec.init_weights(
+    latent = layers.init_dense(latent_key, coarse, LATENT, initializer=jax.nn.initializers.glorot_normal())
+    decoder = s2d_dec.init_weights(
         decode_key, hierarchy, inputs=LATENT + scale.landmark_mean.size, channels=channels, outputs=3
     )
-    return Neural3DMM(scale, {"encoder": convs, "latent": latent, "decoder": decode})
+    return Neural3DMM(scale, {"encoder": convs, "latent": latent, "decoder": decoder})
 
 
 @jax.jit
 def apply(
-    params: Neural3DMM, hierarchy: Hierarchy, down: tuple[Stencil, ...], displacements: Array, neutral: Array
-) -> Array:
-    """Positions (B, N, 3) of the vertices from landmark displacements (B, L, 3) and neutral faces (B, N, 3).
+    params: Neural3DMM,
+    hierarchy: Hierarchy,
+    down: tuple[Stencil, ...],
+    displacements: Float[Array | np.ndarray, "*B L 3"],
+    neutral: Float[Array | np.ndarray, "*B N 3"],
+) -> Float[Array, "B N 3"]:
+    """Return vertex positions from landmark displacements (B, L, 3) and neutral faces (B, N, 3).
 
-    `down` are `descents(hierarchy)`.
+    `down` is `downsampling_spirals(hierarchy)`.
+
+    Raises:
+      ValueError: wrong shapes.
     """
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     marks, face = scale.landmark_mean.shape, scale.face.shape
@@ -114,17 +112,18 @@ def apply(
             f"{displacements.shape} and {neutral.shape}"
         )
     latent = encode(params, down, neutral)
-    moved = (displacements - scale.landmark_mean).reshape(len(displacements), -1) / scale.landmark_std
-    found = s2d_dec.decode(weights["decoder"], hierarchy, jnp.concatenate([latent, moved], axis=-1))
-    return scale.face + scale.face_std * found.transpose(1, 0, 2)
+    standard = (displacements - scale.landmark_mean).reshape(len(displacements), -1) / scale.landmark_std
+    decoded = s2d_dec.decode(weights["decoder"], hierarchy, jnp.concatenate([latent, standard], axis=-1))
+    return scale.face + scale.face_std * decoded.transpose(1, 0, 2)
 
 
 @jax.jit
-def encode(params: Neural3DMM, down: tuple[Stencil, ...], neutral: Array) -> Array:
-    """The latent code (B, 16) of neutral faces (B, N, 3)."""
+def encode(
+    params: Neural3DMM, down: tuple[Stencil, ...], neutral: Float[Array | np.ndarray, "B N 3"]
+) -> Float[Array, "B latent"]:
+    """Return the latent codes (B, 16) of neutral faces."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
     x = ((neutral - scale.face) / scale.face_std).transpose(1, 0, 2)
     for conv, stencil in zip(weights["encoder"], down, strict=True):
-        x = jax.nn.elu(spiral_conv.spiral_conv(x, conv["kernel"], stencil) + conv["bias"])
-    flat = x.transpose(1, 0, 2).reshape(x.shape[1], -1)
-    return flat @ weights["latent"]["kernel"] + weights["latent"]["bias"]
+        x = jax.nn.elu(layers.spiral_conv(conv, x, stencil))
+    return layers.dense(weights["latent"], x.transpose(1, 0, 2).reshape(x.shape[1], -1))

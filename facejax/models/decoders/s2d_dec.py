@@ -107,7 +107,11 @@ def decode_levels(weights: Weights, hierarchy: Hierarchy, x: Float[Array, "B inp
 
 @partial(jax.jit, static_argnames="chunk")
 def apply(
-    params: S2DDec, hierarchy: Hierarchy, displacements: Float[Array | np.ndarray, "... L 3"], *, chunk: int | None = None
+    params: S2DDec,
+    hierarchy: Hierarchy,
+    displacements: Float[Array | np.ndarray, "... L 3"],
+    *,
+    chunk: int | None = None,
 ) -> Float[Array, "... N 3"]:
     """Return vertex displacements in mm from landmark displacements in mm.
 

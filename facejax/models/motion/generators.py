@@ -1,11 +1,15 @@
-"""One call for every generator of motion: the GAN, the GAN as its authors built it, the flow.
+"""Generators of motion behind one interface: Motion3DGAN, its authors' architecture, and flow matching.
 
-Which one it is follows from the type of its parameters, which is known when a function is traced.
+The generator is selected by the type of its parameters, which is static when a function is traced.
 """
+
+from __future__ import annotations
 
 from functools import partial
 
 import jax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from facejax.models.motion import flow_matching, motion3dgan, motion3dgan_reference
 from facejax.models.motion.tangent_pca import Motion
@@ -20,15 +24,26 @@ KINDS = {
 
 @partial(jax.jit, static_argnames="steps")
 def sample(
-    params: Generator, key: jax.Array, start, end, pose: jax.Array, *, steps: int = flow_matching.STEPS
+    params: Generator,
+    key: Array,
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array, " D"],
+    *,
+    steps: int = flow_matching.STEPS,
 ) -> Motion:
-    """Draw a motion between two labels that starts at a pose (D,): q (T-1, L, 3), log-length and log-seconds ().
+    """Draw a motion between two labels that starts at a pose: q (T-1, L, 3), log-length and log-seconds ().
 
-    `start`, `end` are label numbers (0: neutral), which are taken as they come: `pipeline.label_indices` checks names.
-    A pose to start from is drawn by `starts.sample`, measured by `charts.pose`, or zero: the mean peak. `steps` of
-    integration are the flow's alone. The curve of a motion is `srvf.decode(q, log_length, charts.unpose(chart, pose,
-    start))`: displacements from neutral, unitless. On this sphere a point's Frobenius norm is the root of T-1.
-    Raises `TypeError` for parameters that are no generator's.
+    The curve of a motion is `srvf.decode(q, log_length, tangent_pca.decode_pose(chart, pose, start))`: unitless
+    displacements from neutral. The Frobenius norm of q is the square root of T-1.
+
+    Args:
+      start, end: label indices (0: neutral), not checked; `pipeline.label_indices` looks up names.
+      pose: from `start_poses.sample` or `tangent_pca.encode_pose`, or zero for the mean peak.
+      steps: of integration, for flow matching only.
+
+    Raises:
+      TypeError: parameters that are not those of a generator.
     """
     if isinstance(params, flow_matching.FlowMatching):
         return flow_matching.sample(params, key, start, end, pose, steps=steps)
@@ -36,15 +51,19 @@ def sample(
 
 
 def kind(params: Generator) -> str:
-    """ "gan", "reference" or "flow". Raises `TypeError` for anything else."""
-    for name, of in KINDS.items():
-        if isinstance(params, of):
+    """Return "gan", "reference" or "flow".
+
+    Raises:
+      TypeError: parameters that are not those of a generator.
+    """
+    for name, record in KINDS.items():
+        if isinstance(params, record):
             return name
     raise TypeError(f"expected the parameters of a generator, such as models.motion; got {type(params).__name__}")
 
 
 def uses_start_pose(params: Generator) -> bool:
-    """Whether the motion depends on the pose that it starts from. The authors' does not."""
+    """Return whether the motion depends on the start pose; that of `motion3dgan_reference` does not."""
     return not isinstance(params, motion3dgan_reference.Motion3DGANReference)
 
 

@@ -1,15 +1,16 @@
-"""Motion3DGAN, sized for a CPU: noise and two labels in, a landmark motion on the SRVF sphere out.
+"""Motion3DGAN, sized for a CPU: a conditional GAN from noise and two labels to a landmark motion on the SRVF sphere.
 
-After Otberdout et al. 2023, 3.1, with an architecture of our own; theirs is
-`facejax.models.motion_reference`. A residual network turns noise and label embeddings into coordinates of
-the training set's tangent chart (`facejax.models.charts`). The linear output basis makes jitter impossible
-that the data do not have, and 5,916 outputs cost no more to train than its R directions. The critic reads
-the same coordinates.
+After Otberdout et al. 2023, 3.1, with another architecture; the authors' own is
+`facejax.models.motion.motion3dgan_reference`. A residual network maps noise and label embeddings to coordinates of the
+chart (`facejax.models.motion.tangent_pca`). The linear output basis excludes jitter that is absent from the data, and
+training 5,916 outputs costs no more than training R coordinates. The critic reads the same coordinates.
 
-Both networks are told the two labels and the pose that the motion starts from: a mouth that is drawn to the left
-moves otherwise to an open mouth than one that is drawn to the right. Both handle one sample; the caller vmaps.
-`start`, `end` are label indices, 0 ... K - 1; `pose` is (D,), see `charts`.
+Both networks are conditioned on the two labels and on the pose that the motion starts from: the motion to an open mouth
+differs between a mouth drawn to the left and one drawn to the right. Functions take one sample; the caller vmaps.
+`start` and `end` are label indices, 0 ... K - 1; `pose` is (D,), see `tangent_pca`.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
@@ -17,16 +18,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
 
 from facejax.geometry import sphere
+from facejax.models import layers
+from facejax.models.layers import Weights
 from facejax.models.motion import tangent_pca
 from facejax.models.motion.tangent_pca import Motion, TangentPCA
 
-Weights = dict[str, Any]
-
 
 class Config(NamedTuple):
-    """Sizes, all static; the default generator and critic count 2.0 M numbers, chart included."""
+    """Sizes, all static; the default generator and critic have 2.0 M parameters, chart included."""
 
     steps: int = 29  # T - 1
     landmarks: int = 68
@@ -43,43 +46,43 @@ DEFAULT = Config()
 
 
 class Motion3DGAN(NamedTuple):
-    """One network: the chart it speaks in, and the weights that are trained."""
+    """Parameters of one network, generator or critic: the chart and the trained weights."""
 
     chart: TangentPCA
     weights: Weights
 
 
 class Network(NamedTuple):
-    """Pure functions of one network; `inner` is `apply` in the chart's coordinates, which training runs."""
+    """Pure functions of one network; `apply_coordinates` is `apply` in the chart's coordinates, used in training."""
 
-    init: Callable
-    apply: Callable
-    inner: Callable
+    init: Callable[..., Motion3DGAN]
+    apply: Callable[..., Any]
+    apply_coordinates: Callable[..., Array]
 
 
-def _init_generator(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
-    """A generator that starts as a Gaussian: the right mean and spread of every pair."""
+def _init_generator(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
+    """Return a generator whose initial output is Gaussian, with the mean and standard deviation of every label pair."""
     _check_chart(chart, config)
     stem_key, label_key, blocks_key = jax.random.split(key, 3)
     weights = {
         "labels": jax.random.normal(label_key, (2, config.labels, config.embedding)),
-        "stem": _dense(stem_key, config.noise + config.pose + 2 * config.embedding, config.width),
+        "stem": layers.init_dense(stem_key, config.noise + config.pose + 2 * config.embedding, config.width),
         "blocks": _blocks(blocks_key, config),
-        "head": _zeros(config.width, config.rank + tangent_pca.SCALARS),
-        # Each of the widest directions, and length and duration, get a noise of their own.
+        "head": layers.zero_dense(config.width, config.rank + tangent_pca.SCALARS),
+        # Length, duration and each of the leading directions have a noise input of their own.
         "skip": jnp.eye(config.noise, config.rank + tangent_pca.SCALARS),
     }
     return Motion3DGAN(chart, weights)
 
 
 @jax.jit
-def _generate_coordinates(params: Motion3DGAN, noise: jax.Array, start, end, pose: jax.Array) -> jax.Array:
-    """Coordinates (2 + R,) from noise (128,) ~ N(0, 1), two label indices and a pose (D,)."""
+def _generate_coordinates(params: Motion3DGAN, noise: Array, start: ArrayLike, end: ArrayLike, pose: Array) -> Array:
+    """Return coordinates (2 + R,) from noise (128,) ~ N(0, 1), two label indices and a pose (D,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     _check_noise(noise, weights)
     hidden = jnp.concatenate([noise, weights["labels"][0, start], weights["labels"][1, end], pose])
-    hidden = _residual_stack(weights, hidden, jax.nn.silu)
-    deviation = noise @ weights["skip"] + _linear(weights["head"], hidden)
+    hidden = layers.residual_stack(weights, hidden, jax.nn.silu)
+    deviation = noise @ weights["skip"] + layers.dense(weights["head"], hidden)
     return (
         tangent_pca.conditional_mean(chart, start, end, pose)
         + tangent_pca.conditional_std(chart, start, end) * deviation
@@ -88,43 +91,53 @@ def _generate_coordinates(params: Motion3DGAN, noise: jax.Array, start, end, pos
 
 @jax.jit
 def _generate(
-    params: Motion3DGAN, noise: jax.Array, start, end, pose: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Tangent vector at p (T-1, L, 3), log-length and log-seconds () from noise (128,), two label indices, a pose."""
+    params: Motion3DGAN, noise: Array, start: ArrayLike, end: ArrayLike, pose: Array
+) -> tuple[Array, Array, Array]:
+    """Return a tangent vector at p (T-1, L, 3), log-length and log-seconds () from noise, two labels and a pose."""
     values = _generate_coordinates(params, noise, start, end, pose)
     return tangent_pca.decode(jax.lax.stop_gradient(params.chart), values, start, end)
 
 
-def _init_critic(key: jax.Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
+def _init_critic(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) -> Motion3DGAN:
+    """Return a critic with random weights."""
     _check_chart(chart, config)
     stem_key, label_key, blocks_key, head_key = jax.random.split(key, 4)
     weights = {
         "labels": jax.random.normal(label_key, (2, config.labels, config.embedding)),
-        "stem": _dense(stem_key, config.rank + tangent_pca.SCALARS + config.pose + 2 * config.embedding, config.width),
+        "stem": layers.init_dense(
+            stem_key, config.rank + tangent_pca.SCALARS + config.pose + 2 * config.embedding, config.width
+        ),
         "blocks": _blocks(blocks_key, config),
-        "head": _dense(head_key, config.width, 1),
+        "head": layers.init_dense(head_key, config.width, 1),
     }
     return Motion3DGAN(chart, weights)
 
 
 @jax.jit
-def _score(params: Motion3DGAN, values: jax.Array, start, end, pose: jax.Array) -> jax.Array:
-    """How real a motion looks, from its coordinates (2 + R,); any real number, larger is more real."""
+def _score(params: Motion3DGAN, values: Array, start: ArrayLike, end: ArrayLike, pose: Array) -> Array:
+    """Return the critic's score () of coordinates (2 + R,), any real number; larger is more real."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
-    # Centred, and brought to order one by a single factor: a factor per direction would blow up the gradient
-    # along the narrow ones, which the penalty then fights.
+    # Centred, and scaled to order one by a single factor: a factor per direction would amplify the gradient along
+    # directions of small variance, which conflicts with the gradient penalty.
     offset = values - tangent_pca.conditional_mean(chart, start, end, pose)
     factor = 1 / jnp.sqrt(jnp.mean(jnp.square(chart.scale[start, end])))
     offset = offset.at[tangent_pca.SCALARS :].multiply(factor)
     hidden = jnp.concatenate([offset, weights["labels"][0, start], weights["labels"][1, end], pose])
-    return _linear(weights["head"], _residual_stack(weights, hidden, partial(jax.nn.leaky_relu, negative_slope=0.2)))[0]
+    leaky_relu = partial(jax.nn.leaky_relu, negative_slope=0.2)
+    return layers.dense(weights["head"], layers.residual_stack(weights, hidden, leaky_relu))[0]
 
 
 @jax.jit
 def _criticise(
-    params: Motion3DGAN, tangent: jax.Array, log_length, log_seconds, start, end, pose: jax.Array
-) -> jax.Array:
-    """How real a tangent vector at p (T-1, L, 3) with a log-length and log-seconds () looks for labels and pose."""
+    params: Motion3DGAN,
+    tangent: Array,
+    log_length: ArrayLike,
+    log_seconds: ArrayLike,
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Array,
+) -> Array:
+    """Return the critic's score () of a tangent vector at p (T-1, L, 3), log-length and log-seconds ()."""
     chart = jax.lax.stop_gradient(params.chart)
     values = tangent_pca.encode(chart, tangent, log_length, log_seconds, start, end)
     return _score(params, values, start, end, pose)
@@ -135,35 +148,15 @@ critic = Network(_init_critic, _criticise, _score)
 
 
 @jax.jit
-def sample(params: Motion3DGAN, key: jax.Array, start, end, pose: jax.Array) -> Motion:
-    """Draw a motion between two labels that starts at a pose (D,)."""
+def sample(params: Motion3DGAN, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array, " D"]) -> Motion:
+    """Draw a motion between two labels that starts at a pose."""
     noise = jax.random.normal(key, params.weights["skip"].shape[:1])
     tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
     return Motion(sphere.exp(params.chart.p, tangent), log_length, log_seconds)
 
 
-def _dense(key: jax.Array, inputs: int, outputs: int) -> Weights:
-    kernel = jax.nn.initializers.he_normal()(key, (inputs, outputs))
-    return {"kernel": kernel, "bias": jnp.zeros(outputs)}
-
-
-def _zeros(inputs: int, outputs: int) -> Weights:
-    return {"kernel": jnp.zeros((inputs, outputs)), "bias": jnp.zeros(outputs)}
-
-
-def _linear(layer: Weights, x: jax.Array) -> jax.Array:
-    return x @ layer["kernel"] + layer["bias"]
-
-
-def _blocks(key: jax.Array, config: Config) -> list[Weights]:
-    return [_dense(k, config.width, config.width) for k in jax.random.split(key, config.blocks)]
-
-
-def _residual_stack(weights: Weights, x: jax.Array, activation) -> jax.Array:
-    x = activation(_linear(weights["stem"], x))
-    for block in weights["blocks"]:
-        x = x + activation(_linear(block, x)) / len(weights["blocks"])
-    return x
+def _blocks(key: Array, config: Config) -> list[Weights]:
+    return [layers.init_dense(k, config.width, config.width) for k in jax.random.split(key, config.blocks)]
 
 
 def _check_chart(chart: TangentPCA, config: Config) -> None:
@@ -176,6 +169,6 @@ def _check_chart(chart: TangentPCA, config: Config) -> None:
         )
 
 
-def _check_noise(noise: jax.Array, weights: Weights) -> None:
+def _check_noise(noise: Array, weights: Weights) -> None:
     if noise.shape != weights["skip"].shape[:1]:
         raise ValueError(f"noise must have shape {weights['skip'].shape[:1]}; got {noise.shape}")

@@ -1,11 +1,11 @@
-"""Where a motion starts when only the expression is known: a distribution of its peaks.
+"""Distribution of start poses: the peak poses from which a motion of a given label starts.
 
-A generator of motions needs to know the face that the motion starts from; OT23 names this as its limit (section 5), and
-takes one mean peak for everybody. People differ, and not as a Gaussian does: a mouth is drawn to the left or to the
-right, never between. So a peak is drawn from those of the training set, pulled towards their mean and blurred by as
-much, which keeps their mean and covariance (the smoothed bootstrap of Silverman & Young 1987).
+A generator of motions is conditioned on the face that the motion starts from; OT23 names this as its limit (section 5),
+and uses one mean peak for everybody. Peaks vary between people, and not as a Gaussian: a mouth is drawn to the left or
+to the right, never in between. So a peak is resampled from the training set, shrunk towards the mean and blurred such
+that mean and covariance are kept (the smoothed bootstrap of Silverman & Young 1987).
 
-Poses are (D,) as in `facejax.models.charts`; K labels, of which 0 is neutral and has the one pose zero.
+Poses are (D,) as in `facejax.models.motion.tangent_pca`; K labels, of which 0 is neutral and has the single pose zero.
 """
 
 from __future__ import annotations
@@ -15,23 +15,28 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
-LIMIT = 2.5  # deviations from the mean beyond which no face of a label is taken to stand
-BLUR = 0.4  # deviation of the blur, in units of the label's own deviation
+from facejax.models import pca
+
+LIMIT = 2.5  # standard deviations from the mean to which poses are clipped
+BLUR = 0.4  # standard deviation of the blur, in units of the label's own
 
 
 class StartPoses(NamedTuple):
-    """Peaks by label; rows beyond a label's count are zero."""
+    """Peaks by label, at most N each; rows beyond a label's count are zero."""
 
-    poses: jax.Array  # (K, N, D)
-    count: jax.Array  # (K,) float
-    root: jax.Array  # (K, D, D), a root of the label's covariance
+    poses: Array  # (K, N, D)
+    count: Array  # (K,) float, number of peaks
+    root: Array  # (K, D, D), a root of the label's covariance
 
 
-def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> StartPoses:
-    """From the poses of peaks (M, D) with labels (M,) in 1..classes-1.
+def fit(poses: Float[np.ndarray, "M D"], labels: Int[np.ndarray, " M"], *, classes: int) -> StartPoses:
+    """Fit the distribution to the poses of peaks with labels in 1..classes-1.
 
-    Raises `ValueError` where an expression has fewer than two peaks.
+    Raises:
+      ValueError: an expression has fewer than two peaks.
     """
     poses, labels = np.asarray(poses, np.float64), np.asarray(labels)
     counts = np.bincount(labels, minlength=classes)
@@ -42,19 +47,18 @@ def fit(poses: np.ndarray, labels: np.ndarray, *, classes: int) -> StartPoses:
     roots = np.zeros((classes, poses.shape[1], poses.shape[1]))
     for label in range(1, classes):
         own = poses[labels == label]
-        # Poses are less their label's mean already, so far as the same motions made the chart.
+        # Not centred: poses are relative to their label's mean already if the chart was fitted to the same motions.
         table[label, : len(own)] = own
-        values, vectors = np.linalg.eigh(np.cov(own.T, bias=True))
-        roots[label] = vectors * np.sqrt(np.maximum(values, 0))
+        roots[label] = pca.covariance_root(np.cov(own.T, bias=True))
     return StartPoses(*(jnp.asarray(x, jnp.float32) for x in (table, counts, roots)))
 
 
 @jax.jit
-def clip_to_distribution(params: StartPoses, pose: jax.Array, label) -> jax.Array:
-    """The pose (D,) brought to within `LIMIT` deviations along each principal axis of the label's peaks.
+def clip_to_distribution(params: StartPoses, pose: Float[Array, " D"], label: ArrayLike) -> Float[Array, " D"]:
+    """Clip a pose to `LIMIT` standard deviations along each principal axis of the label's peaks.
 
-    A chain of transitions ends each one a little beside a real peak. What lies along axes that the label's peaks do not
-    use at all would be carried on, and a network asked about faces that it has never seen.
+    In a chain of transitions the end of each deviates slightly from a real peak. Components along axes without variance
+    are removed, since they would accumulate into faces that the generator has never been trained on.
     """
     root, count = params.root[label], params.count[label]
     mean = jnp.sum(params.poses[label], axis=0) / count
@@ -65,8 +69,8 @@ def clip_to_distribution(params: StartPoses, pose: jax.Array, label) -> jax.Arra
 
 
 @jax.jit
-def sample(params: StartPoses, key: jax.Array, label) -> jax.Array:
-    """Draw the pose (D,) of a peak; neutral's is zero."""
+def sample(params: StartPoses, key: Array, label: ArrayLike) -> Float[Array, " D"]:
+    """Draw the pose of a peak; zero for the label neutral."""
     which_key, blur_key = jax.random.split(key)
     count = params.count[label]
     which = jnp.minimum(jnp.floor(jax.random.uniform(which_key) * count), count - 1).astype(jnp.int32)

@@ -1,6 +1,7 @@
-"""The tangent chart of a set of motions: what they fix once, before any network is trained.
+"""Tangent PCA: the linear chart of a set of motions, fitted once before any network is trained.
 
-Motions are points on the SRVF sphere; at a reference point p, log_p turns each into a tangent vector.
+Motions are points on the SRVF sphere; log_p at a reference point p maps each to a tangent vector, and PCA reduces the
+tangent vectors to coordinates.
 
 Vocabulary
   coordinates  (2 + R,) numbers for one motion: the standardised log-length and log-seconds, then the tangent
@@ -12,61 +13,77 @@ Vocabulary
   start, end   label indices, 0 ... K - 1; 0 is neutral.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
 from facejax.geometry import sphere
+from facejax.models import pca
 
-MIN_PAIR_MOTIONS = 8  # motions of a pair below which its own spread is not trusted
-RIDGE = 0.01  # of the regression on poses, in units of their unit variance per motion
+MIN_PAIR_MOTIONS = 8  # below this, a pair's own standard deviations are replaced by the pooled ones
+RIDGE = 0.01  # of the regression on poses, per motion and unit variance
 SCALARS = 2  # log-length, log-seconds
 
 
 class Motion(NamedTuple):
-    """What a generator makes: a point on the sphere, how long the path is, and how long it takes."""
+    """The output of a generator: a point on the SRVF sphere, the path length and the duration."""
 
-    q: jax.Array  # (..., T-1, L, 3)
-    log_length: jax.Array  # (...), of the unitless path
-    log_seconds: jax.Array  # (...)
+    q: Array  # (..., T-1, L, 3)
+    log_length: Array  # (...), of the unitless path
+    log_seconds: Array  # (...)
 
 
 class TangentPCA(NamedTuple):
-    """Constants from the training set, never trained; K labels, R directions, D directions of poses."""
+    """The chart, constant during training; K labels, R directions, D directions of poses."""
 
-    p: jax.Array  # (T-1, L, 3), a point on the sphere
-    basis: jax.Array  # (R, T-1, L, 3), Euclidean orthonormal, orthogonal to p, widest spread first
-    mean: jax.Array  # (K, K, R), mean components of each (start, end)
-    scale: jax.Array  # (K, K, R), deviation along each direction within each (start, end), poses accounted for
-    scalar_mean: jax.Array  # (K, K, 2), mean log-length and log-seconds of each (start, end)
-    scalar_std: jax.Array  # (2,), their deviations within a label pair
-    gain: jax.Array  # (K, D, 2 + R), how coordinates of motions that start at a label follow the pose
-    residual: jax.Array  # (), share of the training motions' squared norm outside the basis
-    pose_mean: jax.Array  # (K, L, 3), mean displacement at which motions of a label start; zero for neutral
-    pose_basis: jax.Array  # (D, L, 3), orthonormal
-    pose_scale: jax.Array  # (D,), deviation of starts along each direction
+    p: Array  # (T-1, L, 3), a point on the sphere
+    basis: Array  # (R, T-1, L, 3), Euclidean orthonormal, orthogonal to p, largest variance first
+    mean: Array  # (K, K, R), mean components of each (start, end)
+    scale: Array  # (K, K, R), standard deviation along each direction within each (start, end), given the pose
+    scalar_mean: Array  # (K, K, 2), mean log-length and log-seconds of each (start, end)
+    scalar_std: Array  # (2,), their standard deviations within a label pair
+    gain: Array  # (K, D, 2 + R), regression of the coordinates on the pose, for each start label
+    residual: Array  # (), share of the training motions' squared norm outside the basis
+    pose_mean: Array  # (K, L, 3), mean displacement at which motions of a label start; zero for neutral
+    pose_basis: Array  # (D, L, 3), orthonormal
+    pose_scale: Array  # (D,), standard deviation of start displacements along each direction
 
 
 def fit(
-    p: np.ndarray,
-    tangents: np.ndarray,
+    p: Float[np.ndarray, "steps L 3"],
+    tangents: Float[np.ndarray, "M steps L 3"],
     motion: Motion,
-    start: np.ndarray,
-    end: np.ndarray,
-    first: np.ndarray,
+    start: Int[np.ndarray, " M"],
+    end: Int[np.ndarray, " M"],
+    first: Float[np.ndarray, "M L 3"],
     *,
     labels: int,
     rank: int = 128,
     pose: int = 32,
 ) -> TangentPCA:
-    """The chart of M training motions: p (T-1, L, 3), tangents log_p q (M, T-1, L, 3), first frames `first` (M, L, 3).
+    """Fit the chart of M training motions.
 
-    Of `decode` the log-length and log-seconds (M,) are read; `start`, `end` are labels (M,) in 0..labels-1.
-    The directions span the R principal ones of all tangent vectors, and are turned within that span so that
-    the spread within label pairs is uncorrelated. Pairs without a motion get the sum of a start's and an
-    end's effect as mean; pairs with fewer than 8 the spread of all.
+    The directions span the leading R principal components of all tangent vectors, and are rotated within that span so
+    that they are uncorrelated within label pairs. The mean of a pair without motions is the sum of a start and an end
+    effect; pairs with fewer than `MIN_PAIR_MOTIONS` get the pooled standard deviation.
+
+    Args:
+      p: reference point on the sphere.
+      tangents: log_p of the motions.
+      motion: of which log-length and log-seconds (M,) are used.
+      start, end: labels in 0..labels-1.
+      first: first frames, as displacements from neutral.
+      rank: R.
+      pose: D.
+
+    Raises:
+      ValueError: wrong shapes, no more motions than `rank`, or values that are not finite.
     """
     shape = p.shape
     if p.ndim != 3 or tangents.shape[1:] != shape:
@@ -77,86 +94,101 @@ def fit(
     normal = np.ravel(p) / np.linalg.norm(p)
     if not np.isfinite(flat).all():
         raise ValueError(f"motion {np.flatnonzero(~np.isfinite(flat).all(1))[0]} is not finite")
-    span = _principal_directions(flat, rank)
+    span = pca.leading_components(flat, rank)
     span = np.linalg.qr((span - np.outer(span @ normal, normal)).T)[0].T.astype(np.float32)
     components = (flat @ span.T).astype(np.float64)
     outside = 1.0 - np.sum(components**2) / np.sum(np.square(flat, dtype=np.float64))
     mean = _pair_means(components, start, end, labels)
     within = components - mean[start, end]
-    turn = np.linalg.eigh(within.T @ within / len(within))[1][:, ::-1]
+    rotation = pca.from_covariance(within.T @ within / len(within))[1]
 
     pose_mean, pose_basis, pose_scale = _poses(np.asarray(first, np.float64), start, labels, pose)
     poses = (first - pose_mean[start]).reshape(len(first), -1) @ pose_basis.T / pose_scale
     scalars = np.stack([motion.log_length, motion.log_seconds], axis=1).astype(np.float64)
     scalar_mean = _pair_means(scalars, start, end, labels)
     scalar_std = np.maximum(np.std(scalars - scalar_mean[start, end], axis=0), 1e-6)
-    deviation = np.concatenate([(scalars - scalar_mean[start, end]) / scalar_std, within @ turn], axis=1)
+    deviation = np.concatenate([(scalars - scalar_mean[start, end]) / scalar_std, within @ rotation], axis=1)
     gain = _regression(poses, deviation, start, labels)
-    left = deviation - np.einsum("md,mdr->mr", poses, gain[start])
-    pooled = np.mean(left[:, SCALARS:] ** 2, axis=0)
-    scale = _pair_spreads(left[:, SCALARS:], np.maximum(pooled, 1e-12 * pooled.max()), start, end, labels)
-    basis = (turn.T @ span).reshape(-1, *shape)
-    arrays = p, basis, mean @ turn, scale, scalar_mean, scalar_std, gain, outside
+    residual = deviation - np.einsum("md,mdr->mr", poses, gain[start])
+    pooled = np.mean(residual[:, SCALARS:] ** 2, axis=0)
+    scale = _pair_std(residual[:, SCALARS:], np.maximum(pooled, 1e-12 * pooled.max()), start, end, labels)
+    basis = (rotation.T @ span).reshape(-1, *shape)
+    arrays = p, basis, mean @ rotation, scale, scalar_mean, scalar_std, gain, outside
     poses = pose_mean, pose_basis.reshape(-1, *shape[1:]), pose_scale
     return TangentPCA(*(jnp.asarray(array, jnp.float32) for array in (*arrays, *poses)))
 
 
 @jax.jit
-def encode(chart: TangentPCA, tangent: jax.Array, log_length: jax.Array, log_seconds: jax.Array, start, end):
-    """Coordinates (2 + R,) of a tangent at p (T-1, L, 3), less what the basis lacks, and two scalars ()."""
+def encode(
+    chart: TangentPCA,
+    tangent: Float[Array | np.ndarray, "steps L 3"],
+    log_length: ArrayLike,
+    log_seconds: ArrayLike,
+    start: ArrayLike,
+    end: ArrayLike,
+) -> Float[Array, " coordinates"]:
+    """Return the coordinates (2 + R,) of a tangent vector at p projected onto the basis, and of two scalars ()."""
     scalars = (jnp.stack([log_length, log_seconds]) - chart.scalar_mean[start, end]) / chart.scalar_std
     return jnp.concatenate([scalars, jnp.tensordot(chart.basis, tangent, 3)])
 
 
 @jax.jit
-def decode(chart: TangentPCA, values: jax.Array, start, end) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Coordinates (2 + R,) -> the tangent vector at p (T-1, L, 3), exactly tangent, log-length and log-seconds ()."""
+def decode(
+    chart: TangentPCA, values: Float[Array | np.ndarray, " coordinates"], start: ArrayLike, end: ArrayLike
+) -> tuple[Float[Array, "steps L 3"], Float[Array, ""], Float[Array, ""]]:
+    """Return the tangent vector at p, made exactly tangent, log-length and log-seconds of coordinates (2 + R,)."""
     tangent = sphere.project(chart.p, jnp.tensordot(values[SCALARS:], chart.basis, 1))
     log_length, log_seconds = chart.scalar_mean[start, end] + chart.scalar_std * values[:SCALARS]
     return tangent, log_length, log_seconds
 
 
 @jax.jit
-def encode_pose(chart: TangentPCA, displacement: jax.Array, start) -> jax.Array:
-    """The pose (D,) of a displacement from neutral (L, 3) at which a motion of the label `start` starts."""
-    inside = jnp.tensordot(chart.pose_basis, displacement - chart.pose_mean[start], 2) / chart.pose_scale
-    return jnp.where(jnp.asarray(start) == 0, 0.0, inside)
+def encode_pose(
+    chart: TangentPCA, displacement: Float[Array | np.ndarray, "L 3"], start: ArrayLike
+) -> Float[Array, " D"]:
+    """Return the pose of a first frame, given as displacement from neutral; zero if its label `start` is neutral."""
+    pose = jnp.tensordot(chart.pose_basis, displacement - chart.pose_mean[start], 2) / chart.pose_scale
+    return jnp.where(jnp.asarray(start) == 0, 0.0, pose)
 
 
 @jax.jit
-def decode_pose(chart: TangentPCA, pose: jax.Array, start) -> jax.Array:
-    """The displacement (L, 3) of a pose (D,)."""
+def decode_pose(chart: TangentPCA, pose: Float[Array | np.ndarray, " D"], start: ArrayLike) -> Float[Array, "L 3"]:
+    """Return the displacement from neutral of a pose."""
     return chart.pose_mean[start] + jnp.tensordot(pose * chart.pose_scale, chart.pose_basis, 1)
 
 
 @jax.jit
-def conditional_mean(chart: TangentPCA, start, end, pose: jax.Array) -> jax.Array:
-    """The mean coordinates (2 + R,) of a pair's motions from a pose (D,), by linear regression."""
+def conditional_mean(
+    chart: TangentPCA, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
+) -> Float[Array, " coordinates"]:
+    """Return the mean coordinates (2 + R,) of a label pair's motions given the pose, by linear regression."""
     return jnp.append(jnp.zeros(SCALARS), chart.mean[start, end]) + pose @ chart.gain[start]
 
 
 @jax.jit
-def conditional_std(chart: TangentPCA, start, end) -> jax.Array:
-    """The deviation (2 + R,) of the coordinates of a pair about `conditional_mean`."""
+def conditional_std(chart: TangentPCA, start: ArrayLike, end: ArrayLike) -> Float[Array, " coordinates"]:
+    """Return the standard deviation (2 + R,) of the coordinates of a label pair about `conditional_mean`."""
     return jnp.append(jnp.ones(SCALARS), chart.scale[start, end])
 
 
-def _poses(here: np.ndarray, start: np.ndarray, labels: int, directions: int):
-    """Means (K, L, 3), principal directions (D, 3L) and deviations (D,) of first frames (M, L, 3)."""
+def _poses(
+    first: np.ndarray, start: np.ndarray, labels: int, directions: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return means (K, L, 3), principal directions (D, 3L) and standard deviations (D,) of first frames (M, L, 3)."""
     count = np.bincount(start, minlength=labels)
-    mean = np.zeros((labels, *here.shape[1:]))
-    np.add.at(mean, start, here)
+    mean = np.zeros((labels, *first.shape[1:]))
+    np.add.at(mean, start, first)
     mean /= np.maximum(count, 1)[:, None, None]
     mean[0] = 0
-    within = (here - mean[start])[np.asarray(start) > 0].reshape(-1, here[0].size)
-    within = within if len(within) else np.zeros((1, here[0].size))
-    values, vectors = np.linalg.eigh(within.T @ within / len(within))
-    values, basis = values[::-1][:directions], vectors[:, ::-1][:, :directions].T
+    within = (first - mean[start])[np.asarray(start) > 0].reshape(-1, first[0].size)
+    within = within if len(within) else np.zeros((1, first[0].size))
+    values, vectors = pca.from_covariance(within.T @ within / len(within))
+    values, basis = values[:directions], vectors[:, :directions].T
     return mean, basis, np.sqrt(np.maximum(values, 1e-12 * max(values[0], 1e-12)))
 
 
 def _regression(poses: np.ndarray, deviation: np.ndarray, start: np.ndarray, labels: int) -> np.ndarray:
-    """Ridge regression (K, D, C) of deviations (M, C) on poses (M, D), for each label of start."""
+    """Return the ridge regression (K, D, C) of deviations (M, C) on poses (M, D), for each start label."""
     gain = np.zeros((labels, poses.shape[1], deviation.shape[1]))
     for label in range(1, labels):
         own = start == label
@@ -165,43 +197,31 @@ def _regression(poses: np.ndarray, deviation: np.ndarray, start: np.ndarray, lab
     return gain
 
 
-def _principal_directions(flat: np.ndarray, rank: int) -> np.ndarray:
-    """The `rank` leading right singular vectors (rank, D) of (M, D), by subspace iteration.
+def _pair_std(within: np.ndarray, pooled: np.ndarray, start: np.ndarray, end: np.ndarray, labels: int) -> np.ndarray:
+    """Return standard deviations (K, K, R) of centred components (M, R) per label pair; pooled for rare pairs.
 
-    The full decomposition of 20,000 x 5,916 takes minutes; this takes ten thin products.
-    """
-    span = np.random.default_rng(0).standard_normal((flat.shape[1], min(rank + 32, *flat.shape)), np.float32)
-    for _ in range(4):
-        span = np.linalg.qr(flat.T @ (flat @ span))[0]
-    values, turn = np.linalg.eigh(np.float64(flat @ span).T @ np.float64(flat @ span))
-    return (span @ turn[:, np.argsort(-values)[:rank]]).T
-
-
-def _pair_spreads(within: np.ndarray, pooled: np.ndarray, start, end, labels: int) -> np.ndarray:
-    """Standard deviations (K, K, R) of components (M, R) about their pair's mean; the pooled variance where few.
-
-    Pairs differ: along the direction that tells a mouth drawn left from one drawn right, only those with such a
-    mouth spread at all, and one spread for all would give the others a motion that they never make.
+    Pairs differ: along the direction that separates a mouth drawn left from one drawn right, only pairs with such a
+    mouth vary at all, and a pooled deviation would give the others a motion that they never make.
     """
     pair = np.asarray(start) * labels + np.asarray(end)
     count = np.bincount(pair, minlength=labels**2)
     total = np.zeros((labels**2, within.shape[1]))
     np.add.at(total, pair, within**2)
-    # The mean was fitted too: one degree of freedom less.
+    # One degree of freedom is spent on the mean.
     own = total / np.maximum(count - 1, 1)[:, None]
     variance = np.where(count[:, None] >= MIN_PAIR_MOTIONS, np.maximum(own, 1e-6 * pooled), pooled)
     return np.sqrt(variance).reshape(labels, labels, -1)
 
 
 def _pair_means(values: np.ndarray, start: np.ndarray, end: np.ndarray, labels: int) -> np.ndarray:
-    """Mean of values (M, C) for each pair (K, K, C); absent pairs by least squares on start + end effects."""
+    """Return the mean (K, K, C) of values (M, C) per label pair; absent pairs from start + end effects."""
     pair = np.asarray(start) * labels + np.asarray(end)
     count = np.bincount(pair, minlength=labels**2)
     total = np.zeros((labels**2, values.shape[1]))
     np.add.at(total, pair, values)
     seen = np.flatnonzero(count)
     means = total / np.maximum(count, 1)[:, None]
-    which = np.eye(labels)
-    design = np.concatenate([np.repeat(which, labels, 0), np.tile(which, (labels, 1))], axis=1)
+    one_hot = np.eye(labels)
+    design = np.concatenate([np.repeat(one_hot, labels, 0), np.tile(one_hot, (labels, 1))], axis=1)
     additive = design @ np.linalg.lstsq(design[seen], means[seen], rcond=None)[0]
     return np.where(count[:, None] > 0, means, additive).reshape(labels, labels, -1)

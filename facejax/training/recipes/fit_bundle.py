@@ -1,8 +1,7 @@
-"""Everything that `facejax generate` needs, trained on one dataset: a store in, models out.
+"""Fit all models of a model file to one dataset: the generator of motion, its start poses, and the mesh decoder.
 
-The generator of motion (`facejax.fit_motion`), the peaks that it starts from, and the way from landmarks to meshes
-(`facejax.fit_residual`). The dataset has to hold recordings that go from neutral to an expression and back. Each stage
-keeps checkpoints in its folder and goes on from there when called again.
+The dataset must contain recordings from neutral to an expression and back. Each stage (`fit_motion`, `fit_residual`)
+keeps checkpoints in its folder and resumes from them.
 """
 
 from __future__ import annotations
@@ -19,57 +18,64 @@ from facejax.mesh import rbf_weights
 from facejax.models import bundle
 from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual
 
-MIN_TRAIN_SUBJECTS = 4  # training subjects, so that one fold of each cross-validation holds somebody
+MIN_TRAIN_SUBJECTS = 4  # one per cross-validation fold
 
 
 class Plans(NamedTuple):
-    """How the two networks are trained."""
+    """Training plans of the two networks."""
 
     motion: fit_motion.FlowPlan = fit_motion.FlowPlan()
     residual: fit_residual.ResidualPlan = fit_residual.ResidualPlan()
 
 
 def fit(
-    data: dataset.Dataset, folder: Path, *, plans: Plans = Plans(), seed: int = 0, mesh: Mesh | None = None
+    data: dataset.Dataset, folder: Path, *, plans: Plans = Plans(), seed: int = 0, device_mesh: Mesh | None = None
 ) -> bundle.Models:
-    """Train on the training subjects of a store; `mesh` as in `training.run`.
+    """Fit all models to the training subjects of a dataset; `device_mesh` as in `loop.run`.
 
-    Raises `ValueError` where the store holds too little to learn from.
+    Raises:
+      ValueError: as `check`.
     """
     check(data)
     mean = np.asarray(data.neutral[data.subjects("train")], np.float64).mean(axis=0).astype(np.float32)
     faces, at = np.asarray(data.faces, np.int32), np.asarray(data.landmark_index, np.int32)
     hierarchy = mesh_hierarchy.build(mean, faces)
-    known = motions.join(*transitions.all_pairs(data, "train", label_names=data.labels, per_pair=transitions.CHART_PER_PAIR))
+    known = motions.join(
+        *transitions.all_pairs(data, "train", label_names=data.labels, per_pair=transitions.CHART_PER_PAIR)
+    )
     chart = transitions.fit_chart(known, labels=len(data.labels), rank=transitions.default_rank(known))
     examples = transitions.encode_examples(
         chart, transitions.all_pairs(data, "train", label_names=data.labels, per_pair=transitions.SPREAD_PER_PAIR)
     )
-    generator = fit_motion.fit_flow(examples, chart, folder / "motion", plan=plans.motion, seed=seed, mesh=mesh)
-    beginnings = transitions.fit_start_poses(chart, motions.halves(data, "train"))
+    generator = fit_motion.fit_flow(
+        examples, chart, folder / "motion", plan=plans.motion, seed=seed, device_mesh=device_mesh
+    )
+    starts = transitions.fit_start_poses(chart, motions.halves(data, "train"))
     train = mesh_subset.of_split(data, "train")
-    # As many components as the file will hold: the network refines the very answer that it will meet.
+    # As many components as a model file holds, so that the network is trained on the estimate that it will refine.
     base = fit_gpmm.fit(train, components=bundle.COMPONENTS)
-    expander = fit_residual.fit(
-        train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, mesh=mesh
+    decoder = fit_residual.fit(
+        train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, device_mesh=device_mesh
     )
     return bundle.Models(
         labels=data.labels,
         face=bundle.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.face_region(mean, faces, at)),
         motion=generator,
-        starts=beginnings,
+        starts=starts,
         hierarchy=hierarchy,
-        decoder=expander,
+        decoder=decoder,
         about={"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
         | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}},
     )
 
 
 def check(data: dataset.Dataset) -> None:
-    """Raise `ValueError` for a dataset that nothing can be learnt from, with what it lacks."""
+    """Raise `ValueError` for a dataset without the meshes, subjects or recordings that training needs."""
     people = data.subjects("train")
     if len(data.vertices) == 0:
-        raise ValueError(f"{data.path}: holds landmarks alone, expected meshes; `facejax.fit_motion` fits their motion")
+        raise ValueError(
+            f"{data.path}: holds landmarks alone, expected meshes (recipes.fit_motion trains on landmarks)"
+        )
     if len(people) < MIN_TRAIN_SUBJECTS:
         raise ValueError(f"{data.path}: {len(people)} training subjects, expected {MIN_TRAIN_SUBJECTS} or more")
     named = {s.label for s in data.sequences if s.subject in set(people.tolist()) and ">" not in s.label}

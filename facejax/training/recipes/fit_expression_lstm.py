@@ -1,7 +1,7 @@
-"""Training the expression networks of Seo and Luo 2021: recordings in, one network per expression out.
+"""Fit the expression networks of Seo and Luo 2021 to recordings, one network per expression.
 
-All networks are trained in one step, side by side, and each comes out as it would alone. A run is kept in a folder
-(metrics, checkpoints) and goes on from there when it is called again.
+All networks are trained in one vectorised step, with the same result as each alone. A run keeps metrics and checkpoints
+in a folder and resumes from them.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ FEEDS = ("truth", "coin", "switch")
 class ExpressionPlan(NamedTuple):
     """How the networks are trained.
 
-    `feed` says what a network reads while it learns. "truth": the true steps (the paper). "coin": at every frame its
-    own last output with a chance that grows to one (Bengio et al. 2015). "switch": the truth up to some frame and its
-    own output from there on, as when it is used; half of the time from the very start, else from a frame in the first
-    half of the block; a share of the sequences that grows to all.
+    `feed` selects the inputs in training. "truth": the recorded steps (teacher forcing, as in the paper). "coin": at
+    each frame the network's own last output with a probability that grows to one (scheduled sampling, Bengio et al.
+    2015). "switch": recorded steps up to some frame and own output from there on, as in generation; half of the time
+    from the first frame, else from a frame in the first half of the block; for a share of sequences that grows to all.
     """
 
     steps: int = 3_000
     batch: int = 5
     rate: float = 1e-3  # of Adam
-    final_rate: float = 0.0  # share of the rate that is left at the end of a cosine; 1: constant
+    final_rate: float = 0.0  # share of the rate at the end of a cosine decay; 1: constant
     feed: str = "switch"
-    ramp: float = 0.5  # share of the run after which "coin" and "switch" are fully on
+    ramp: float = 0.5  # share of the run after which "coin" and "switch" apply fully
     noise: float = 0.0  # added to the inputs, in root mean squares of a step
     next_step: float = 0.3  # weights of the losses, see `facejax.losses`
     path: float = 1.0
-    energy: float = 10.0  # of the sequences that the network makes from the very start
+    energy: float = 10.0  # of sequences generated from the first frame
 
 
-# Learning rate, batch, steps and loss as published; the length of a "step" is ours, the paper counts epochs.
+# Learning rate, batch and loss as published; the number of steps stands in for the paper's number of epochs.
 PAPER = ExpressionPlan(steps=10_000, final_rate=1.0, feed="truth", next_step=1.0, path=0.0, energy=0.0)
 
 
@@ -60,10 +60,15 @@ def fit(
     masked: bool = True,
     seed: int = 0,
 ) -> expression_lstm.ExpressionLSTM:
-    """Train one network for each of `labels` (name -> its number in `data.label`); parameters stacked, (E, ...).
+    """Train one network per label; returns stacked parameters, (E, ...).
 
-    `frames` and `masked` as of `sequences.block`; a network gives the same numbers alone as in company as long as
-    `frames` is the same. Raises `ValueError` for a label without recordings or an unknown feed.
+    Args:
+      labels: name -> number in `data.label`.
+      frames, masked: as in `sequences.block`; a network's result does not depend on the other networks for equal
+        `frames`.
+
+    Raises:
+      ValueError: a label without recordings, or an unknown feed.
     """
     if plan.feed not in FEEDS:
         raise ValueError(f"feed: expected one of {', '.join(FEEDS)}, got {plan.feed!r}")
@@ -71,7 +76,7 @@ def fit(
     rows = {name: np.flatnonzero(data.label == number) for name, number in labels.items()}
     for name, found in rows.items():
         if not len(found):
-            raise ValueError(f"there is no recording of {name!r} to learn from")
+            raise ValueError(f"labels: there is no recording of {name!r} to train on")
     block = sequences.block(data, frames=frames, masked=masked)
     _claim(folder, data, block, labels, plan, config, seed)
     scales, weights, strengths = [], [], []
@@ -80,7 +85,7 @@ def fit(
         scale = expression_lstm.measure(mine[1], mine[2], mine[3], config=config)
         key = jax.random.fold_in(jax.random.key(seed), number)
         scales.append(scale)
-        strengths.append(losses.strength(jnp.asarray(mine[1]) / scale.step, jnp.asarray(mine[2])))
+        strengths.append(losses.step_energy(jnp.asarray(mine[1]) / scale.step, jnp.asarray(mine[2])))
         weights.append(expression_lstm.init(key, scale, config=config).weights)
     scale, weights = (jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts) for parts in (scales, weights))
     rate = optax.cosine_decay_schedule(plan.rate, plan.steps, alpha=plan.final_rate)
@@ -100,12 +105,12 @@ def fit(
 
 
 def network(params: expression_lstm.ExpressionLSTM, number: int) -> expression_lstm.ExpressionLSTM:
-    """One of the stacked networks."""
+    """Return one of the stacked networks."""
     return jax.tree.map(lambda leaf: leaf[number], params)
 
 
 def _batches(rows: dict[str, np.ndarray], labels: dict[str, int], batch: int, seed: int) -> Callable:
-    """`batches(first, count)`: (steps done (count, E), rows of the block (count, E, B))."""
+    """Return `batches(first, count)`: (steps done (count, E), rows of the block (count, E, B))."""
     orders = {name: loop.epoch_indices(1000 * seed + labels[name], len(rows[name]), batch) for name in labels}
 
     def batches(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -132,12 +137,12 @@ def _loss(plan: ExpressionPlan, config: expression_lstm.Config) -> Callable:
             given = _given(feed_key, mask.shape, jnp.clip(done / (plan.ramp * plan.steps), 0, 1), plan.feed)
             made = expression_lstm.predict_scheduled(params, inputs, given, first)
         made, target = made / scale.step, target / scale.step
-        # Only what is made from the very start: with a beginning to go by, nothing is left to chance.
+        # Only sequences generated from the first frame: after given steps the outcome is determined by them.
         alone = mask & ~jnp.any(given[:, 1:], axis=1, keepdims=True)
         terms = {
             "next_step": plan.next_step * losses.next_step(made, target, mask),
-            "path": plan.path * losses.path(made, target, mask),
-            "energy": plan.energy * losses.energy(made, alone, strength),
+            "path": plan.path * losses.path_distance(made, target, mask),
+            "energy": plan.energy * losses.energy_ratio(made, alone, strength),
         }
         return sum(terms.values()), terms
 
@@ -145,7 +150,7 @@ def _loss(plan: ExpressionPlan, config: expression_lstm.Config) -> Callable:
 
 
 def _given(key: jax.Array, shape: tuple[int, int], share: jax.Array, feed: str) -> jax.Array:
-    """Which inputs are the truth, (B, f) bool, where `share` of the feeding is the network's own."""
+    """Return which inputs are recorded steps, (B, f) bool, with a `share` of own outputs."""
     if feed == "coin":
         return jax.random.uniform(key, shape) >= share
     own_key, frame_key, start_key = jax.random.split(key, 3)

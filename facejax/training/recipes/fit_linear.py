@@ -1,4 +1,4 @@
-"""Linear maps from landmarks to vertices, the weight of the prior chosen by cross-validation."""
+"""Fit linear maps from landmarks to vertices, with the regularisation chosen by cross-validation."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ FOLDS = 4
 def fit_linear(
     model: linear.Model, train: MeshSubset, *, by: str = "subjects", **options
 ) -> tuple[linear.LinearMap, float]:
-    """Fit ridge, PCA or a dictionary, the prior's weight chosen by cross-validation; and that weight.
+    """Fit ridge, PCA or a dictionary; returns the map and the chosen regularisation.
 
-    Held out in turn are quarters of the training subjects, or `by="labels"` of the expressions.
+    Folds are quarters of the training subjects, or with `by="labels"` of the expressions.
     """
-    # Every third mesh decides well enough, and the moments are what takes the time.
+    # Every third mesh suffices for the choice; the moments take most of the time.
     alpha, _ = linear.choose(model, train.thin(3).folds(FOLDS, by=by), ALPHAS, **options)
     return model.fit(train, alpha=alpha, **options), alpha

@@ -1,7 +1,7 @@
-"""Training generators of motion: a dataset in, parameters out.
+"""Fit the generators of motion to a dataset.
 
-Three of one interface: the GAN sized for a CPU, the GAN as its authors built it, and the flow. All learn from the same
-motions; each run keeps metrics and checkpoints in a folder and goes on from there when called again.
+Three with one interface: Motion3DGAN sized for a CPU, its authors' architecture, and flow matching. All are trained on
+the same motions; each run keeps metrics and checkpoints in a folder and resumes from them.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from facejax.training import loop, metric_logger, steps
 
 
 class GanPlan(NamedTuple):
-    """How Motion3DGAN is trained; OT23's figures where it gives them."""
+    """Training plan of Motion3DGAN; values of OT23 where it gives them."""
 
     steps: int = 8_000
     batch: int = 128
     critic_steps: int = 4
     rate: float = 5e-4  # decays along a cosine, to 5 %
     penalty: float = 10.0
-    reconstruction: float = 0.0  # alpha_2 of OT23 (10 there): it narrows the spread within a label pair
+    reconstruction: float = 0.0  # alpha_2 of OT23 (10 there): it reduces the variance within a label pair
     length: float = 0.0  # weight of |log-length error|, which goes with it
     geodesic: float = 0.0  # weight of the geodesic distance, which the authors' program adds (10 there)
     decay: float = 0.999  # of the generator's moving average
 
 
-# The authors' GAN with OT23's own weights and rate.
+# The authors' architecture with OT23's loss weights and learning rate.
 REFERENCE = GanPlan(steps=2_000, rate=1e-4, reconstruction=10.0, length=10.0)
 
 
 class FlowPlan(NamedTuple):
-    """How the flow is trained."""
+    """Training plan of flow matching."""
 
     steps: int = 12_000
     batch: int = 256
     rate: float = 1e-3  # decays along a cosine, to zero
     weight_decay: float = 1e-4
-    whitening: float = 0.5  # 0: errors count as they are on the sphere; 1: in units of each direction's deviation
+    whitening: float = 0.5  # 0: errors on the sphere; 1: in units of each direction's standard deviation
     decay: float = 0.999  # of the moving average
 
 
@@ -61,12 +61,14 @@ def fit_gan(
     config: motion3dgan.Config = motion3dgan.Config(),
     seed: int = 0,
     average: bool = True,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> motion3dgan.Motion3DGAN:
-    """Train the generator against its critic; returns its moving average, or with `average` off its last state.
+    """Train the generator against its critic; returns its moving average, or without `average` its last state.
 
-    Sizes of `config` that the chart knows are the chart's. A stopped run in `folder` goes on; one folder holds one run,
-    and another plan in it is refused. With a `mesh` each batch is shared out, see `training.run`.
+    Sizes of `config` that follow from the chart are replaced. A stopped run in `folder` is resumed.
+
+    Raises:
+      ValueError: `folder` holds a run with another plan, config, seed or motions.
     """
     config = config_for_chart(config, chart)
     _claim(folder, "gan", plan, config, seed, examples.values)
@@ -82,10 +84,10 @@ def fit_gan(
         )
     )
     step = steps.adversarial(
-        lambda weights, chart, key, condition: motion3dgan.generator.inner(
+        lambda weights, chart, key, condition: motion3dgan.generator.apply_coordinates(
             motion3dgan.Motion3DGAN(chart, weights), jax.random.normal(key, (config.noise,)), *condition
         ),
-        lambda weights, chart, values, condition: motion3dgan.critic.inner(
+        lambda weights, chart, values, condition: motion3dgan.critic.apply_coordinates(
             motion3dgan.Motion3DGAN(chart, weights), values, *condition
         ),
         optimisers,
@@ -95,7 +97,7 @@ def fit_gan(
         decay=plan.decay,
     )
     state = steps.init_adversarial(players, optimisers, play_key)
-    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed, mesh)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch * plan.critic_steps, seed, device_mesh)
     return motion3dgan.Motion3DGAN(chart, state.extra if average else state.params.generator)
 
 
@@ -107,12 +109,12 @@ def fit_flow(
     plan: FlowPlan = FlowPlan(),
     config: flow_matching.Config = flow_matching.Config(),
     seed: int = 0,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> flow_matching.FlowMatching:
-    """Train a velocity field; returns its moving average. Chart, config, folder and mesh as in `fit_gan`.
+    """Train a velocity field; returns its moving average. Chart, config, folder and device_mesh as in `fit_gan`.
 
-    Errors count in units of each direction's deviation (to the power `plan.whitening`), so the chart's rank must not
-    exceed the directions along which motions of a pair spread: elsewhere the unit is nothing.
+    Errors are in units of each direction's standard deviation (to the power `plan.whitening`), so the chart's rank must
+    not exceed the directions along which motions of a pair vary: elsewhere the unit is zero.
     """
     config = config_for_chart(config, chart)
     _claim(folder, "flow", plan, config, seed, examples.values)
@@ -126,7 +128,7 @@ def fit_flow(
         source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
         target = jax.vmap(flow_matching.to_state, (None, 0))(chart, values)
         unit = jax.vmap(flow_matching.state_std, (None, 0, 0))(chart, *condition[:2])
-        # Of one size in the mean, whatever the power: the two scalars keep their weight.
+        # Normalised to the same mean for every power, so that the two scalars keep their weight.
         size = jnp.sqrt(jnp.mean(unit ** (2 - 2 * plan.whitening), axis=1, keepdims=True))
         unit = size * unit**plan.whitening
         params = flow_matching.FlowMatching(chart, weights)
@@ -139,7 +141,7 @@ def fit_flow(
     optimiser = optax.adamw(optax.cosine_decay_schedule(plan.rate, plan.steps), weight_decay=plan.weight_decay)
     step = steps.with_moving_average(steps.supervised(loss, optimiser), plan.decay)
     state = steps.init_supervised(weights, optimiser, run_key)._replace(extra=weights)
-    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed, mesh)
+    state = _run(step, state, examples, chart, folder, plan.steps, plan.batch, seed, device_mesh)
     return flow_matching.FlowMatching(chart, state.extra)
 
 
@@ -151,9 +153,9 @@ def fit_reference(
     plan: GanPlan = REFERENCE,
     config: motion3dgan_reference.Config = motion3dgan_reference.Config(),
     seed: int = 0,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> motion3dgan_reference.Motion3DGANReference:
-    """Train the GAN as its authors built it, on whole tangent vectors; returns the generator's moving average."""
+    """Train the authors' architecture on whole tangent vectors; returns the generator's moving average."""
     _, steps_, landmarks, _ = chart.basis.shape
     config = config._replace(steps=steps_, landmarks=landmarks, labels=len(chart.mean))
     q, log_length = srvf.encode(jnp.asarray(known.curves))
@@ -176,7 +178,7 @@ def fit_reference(
         tangent, log_length = motion3dgan_reference.generator.apply(
             params, jax.random.normal(key, (config.noise,)), *pair
         )
-        # The critic sees what log_p makes of exp_p: the same vector, but for angles beyond pi.
+        # The critic sees log_p of exp_p: the same vector, except for angles beyond pi.
         tangent = sphere.log(chart.p, sphere.exp(chart.p, tangent))
         mean, deviation = scalars(chart, pair)
         return {"tangent": tangent, "length": (log_length - mean) / deviation}
@@ -205,12 +207,12 @@ def fit_reference(
         constants=((real, pair), chart),
         chunk=1,
         save_seconds=120.0,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
     return motion3dgan_reference.Motion3DGANReference(chart, state.extra)
 
 
-def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, mesh):
+def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, device_mesh):
     rows = transitions.balance_pairs(examples.start, examples.end, seed)
     order = loop.epoch_indices(seed, len(rows), batch)
     conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
@@ -222,12 +224,12 @@ def _run(step, state, examples: transitions.Examples, chart, folder, count: int,
         folder,
         steps=count,
         constants=held,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
 
 
 def config_for_chart(config, chart: tangent_pca.TangentPCA):
-    """A network's config with the sizes that the chart knows."""
+    """Return a network's config with the sizes of the chart."""
     (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
     return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
 
@@ -235,14 +237,14 @@ def config_for_chart(config, chart: tangent_pca.TangentPCA):
 def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> None:
     if plan.steps < 1:
         raise ValueError(f"plan: expected 1 step or more, got {plan.steps}")
-    digest = hashlib.sha256(np.ascontiguousarray(known)).hexdigest()
+    digest = hashlib.sha256(np.ascontiguousarray(known).data).hexdigest()
     record = {"plan": plan._asdict(), "config": config._asdict(), "seed": seed, "motions": digest, "kind": kind}
     metric_logger.claim_folder(folder, record)
 
 
 def _terms(plan: GanPlan):
     def terms(chart, fake, real, condition):
-        # Equation 6 on tangent vectors; the coordinates expand linearly, so their difference does.
+        # Equation 6 on tangent vectors, which are linear in the coordinates.
         difference = jnp.tensordot((fake - real)[:, tangent_pca.SCALARS :], chart.basis, 1)
         scalars = chart.scalar_std * jnp.mean(jnp.abs((fake - real)[:, : tangent_pca.SCALARS]), axis=0)
         return {

@@ -1,4 +1,4 @@
-"""Training the modified Neural3DMM, a baseline: meshes in, parameters out. A run goes on from where it was stopped."""
+"""Fit the modified Neural3DMM, a baseline, to meshes. A run keeps checkpoints in a folder and resumes from them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BATCH = 16
 
 
 class Neural3DMMPlan(NamedTuple):
-    """How it is trained: L_pr alone (Otberdout et al. 2023, 4.2), otherwise as S2D-Dec."""
+    """Training plan: loss L_pr alone (Otberdout et al. 2023, 4.2), otherwise as S2D-Dec."""
 
     steps: int = 3_000
     batch: int = BATCH
@@ -34,7 +34,7 @@ class Neural3DMMPlan(NamedTuple):
 
 
 class FittedNeural3DMM(NamedTuple):
-    """Everything that `apply` needs."""
+    """The parameters and the index tables that `apply` needs."""
 
     params: neural3dmm.Neural3DMM
     hierarchy: Hierarchy
@@ -48,9 +48,9 @@ def fit(
     *,
     plan: Neural3DMMPlan = Neural3DMMPlan(),
     seed: int = 0,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> FittedNeural3DMM:
-    """Train on meshes; `mesh` as in `training.run`."""
+    """Train on meshes; `device_mesh` as in `loop.run`."""
     data = train.data
     chosen = hashlib.sha256(train.indices.tobytes()).hexdigest()
     metric_logger.claim_folder(
@@ -94,13 +94,13 @@ def fit(
         steps=plan.steps,
         constants=(scale, hierarchy, down, weights, jnp.asarray(data.neutral)),
         chunk=50,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
     return FittedNeural3DMM(neural3dmm.Neural3DMM(scale, state.params), hierarchy, down)
 
 
 def apply(fitted: FittedNeural3DMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    """Vertex displacements (T, N, 3) of one face (N, 3) from its landmarks' (T, L, 3)."""
+    """Return vertex displacements (T, N, 3) of one face (N, 3) from its landmark displacements (T, L, 3)."""
     found = [np.empty((0, *np.shape(neutral)), np.float32)]
     for low in range(0, len(displacements), BATCH):
         marks = np.asarray(displacements[low : low + BATCH], np.float32)

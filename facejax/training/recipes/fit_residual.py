@@ -1,8 +1,8 @@
-"""Training the decoder of residuals on top of the best linear answer.
+"""Fit the GPMM and the residual decoder.
 
-The morphable model is chosen and fitted first (`facejax.fit_gpmm`). The network is trained on what its cross-validated
-answers leave over, which is what it will meet on new faces; a fourth of the people (or labels) is kept to choose the
-gate. A run goes on from its checkpoints; a finished one is read from `network.safetensors`.
+The GPMM is chosen and fitted first (`fit_gpmm`). The network is trained on the residuals of its cross-validated
+predictions, which resemble those on new faces; the last fold of people (or labels) is held out to choose the gate. A
+run resumes from its checkpoints; a finished one is read from `network.safetensors`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from facejax.training import loop, metric_logger, sharding, steps
 from facejax.training.recipes import fit_gpmm
 
 GATES = (0.0, 0.25, 0.5, 0.75, 1.0)
-MIN_RELATIVE_GAIN = 0.995  # a gate that is not 0 has to be better by half a hundredth
+MIN_RELATIVE_GAIN = 0.995  # a gate above 0 must lower the error by 0.5 %
 
 
 class ResidualPlan(NamedTuple):
-    """How the network is trained."""
+    """Training plan of the network."""
 
     steps: int = 2_500
     batch: int = 16
     rate: float = 2e-3  # decays to zero along a cosine
     weight_decay: float = 1e-4
-    # Of the unit: below it the loss is squared. Wrinkles are sparse, and an absolute loss predicts none.
+    # In units of `Scale.unit`: below it the loss is quadratic. Wrinkles are sparse, and an absolute loss predicts none.
     soft: float = 0.1
 
 
@@ -50,11 +50,14 @@ def fit(
     by: str = "subjects",
     seed: int = 0,
     base: fit_gpmm.FittedGPMM | None = None,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> gpmm_residual.GPMMResidual:
-    """Train on meshes. `by` says what will be new at test time: "subjects" or "labels". `base` saves its fit.
+    """Train on meshes.
 
-    `mesh` as in `training.run`.
+    Args:
+      by: what will be new at test time, "subjects" or "labels".
+      base: a fitted GPMM, if there is one.
+      device_mesh: as in `loop.run`.
     """
     folder, data = Path(folder), train.data
     chosen = hashlib.sha256(train.indices.tobytes()).hexdigest()
@@ -68,10 +71,10 @@ def fit(
         return gpmm_residual.GPMMResidual(
             base.params, _load(done, hierarchy, base.params, len(data.landmark_index)), hierarchy, tables
         )
-    answers = base.held_out(train)
+    predictions = base.held_out(train)
     *_, (_, kept) = base.folds
     seen = np.setdiff1d(np.arange(train.count), kept)
-    scale = _measure(train.where(np.isin(np.arange(train.count), seen)), answers[seen], base.params.face)
+    scale = _measure(train.where(np.isin(np.arange(train.count), seen)), predictions[seen], base.params.face)
     init_key, run_key = jax.random.split(jax.random.key(seed))
     params = residual.init(init_key, hierarchy, scale)
 
@@ -82,7 +85,7 @@ def fit(
             residual.ResidualDecoder(scale, trained, jnp.ones(())), hierarchy, tables, marks, start, neutrals[owner]
         )
         squared = jnp.sum(jnp.square((found - target) / scale.unit), axis=-1)
-        # Charbonnier: a distance, squared near zero.
+        # Charbonnier loss: a distance, quadratic near zero.
         value = jnp.mean(jnp.sqrt(squared + plan.soft**2))
         return value, {"error_mm": scale.unit * jnp.mean(jnp.sqrt(squared))}
 
@@ -91,7 +94,7 @@ def fit(
 
     def batches(first: int, count: int):
         rows = seen[indices(first, count).ravel()]
-        found = (*train.read(rows), answers[rows], train.owner[rows])
+        found = (*train.read(rows), predictions[rows], train.owner[rows])
         marks, target, start, owner = (x.reshape(count, plan.batch, *x.shape[1:]) for x in found)
         return marks, start, target, owner
 
@@ -103,12 +106,12 @@ def fit(
         steps=plan.steps,
         constants=(scale, hierarchy, tables, jnp.asarray(data.neutral)),
         chunk=25,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
     network = residual.ResidualDecoder(scale, state.params, jnp.ones(()))
     fitted = gpmm_residual.GPMMResidual(base.params, network, hierarchy, tables)
-    network = network._replace(gate=jnp.float32(_gate(fitted, train, answers, kept)))
-    # What was judged is kept: the answers that it was judged by take a minute to come by.
+    network = network._replace(gate=jnp.float32(_gate(fitted, train, predictions, kept)))
+    # Saved with its gate: computing the held-out predictions for the choice takes a minute.
     if sharding.is_primary():
         weights.save(done, network._asdict())
     sharding.barrier("the network is written")
@@ -121,10 +124,10 @@ def _load(path: Path, hierarchy: Hierarchy, base: gpmm.GPMM, landmarks: int) -> 
     return residual.ResidualDecoder(**jax.tree.map(jnp.asarray, weights.load(path, like._asdict())[0]))
 
 
-def _measure(train: MeshSubset, answers: np.ndarray, face: np.ndarray) -> residual.Scale:
-    sums, squares, left, count = 0.0, 0.0, 0.0, 0
+def _measure(train: MeshSubset, predictions: np.ndarray, face: np.ndarray) -> residual.Scale:
+    sums, squares, left, count = np.zeros(()), 0.0, 0.0, 0
     for marks, vertices in train:
-        left += np.sum(np.square(vertices - answers[count : count + len(vertices)], dtype=np.float64))
+        left += np.sum(np.square(vertices - predictions[count : count + len(vertices)], dtype=np.float64))
         count += len(marks)
         sums, squares = sums + marks.sum(axis=0, dtype=np.float64), squares + np.sum(np.square(marks, dtype=np.float64))
     mean = sums / count
@@ -133,13 +136,13 @@ def _measure(train: MeshSubset, answers: np.ndarray, face: np.ndarray) -> residu
     return residual.Scale(*(jnp.asarray(x, jnp.float32) for x in (face, mean, deviation, unit)))
 
 
-def _gate(fitted: gpmm_residual.GPMMResidual, train: MeshSubset, answers: np.ndarray, kept: np.ndarray) -> float:
-    """The share of the network's answer with the least error on meshes that it was not trained on."""
+def _gate(fitted: gpmm_residual.GPMMResidual, train: MeshSubset, predictions: np.ndarray, kept: np.ndarray) -> float:
+    """Return the share of the network's output with the least error on held-out meshes."""
     errors, count = np.zeros(len(GATES)), 0
     for low in range(0, len(kept), 256):
         rows = kept[low : low + 256 : 2]
         marks, vertices = train.read(rows)
-        base = answers[rows]
+        base = predictions[rows]
         rest = np.asarray(train.data.neutral)[train.owner[rows]]
         whole = np.asarray(gpmm_residual.refine(fitted, marks, base, rest)) - base
         left = vertices - base

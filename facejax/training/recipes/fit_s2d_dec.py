@@ -1,7 +1,7 @@
-"""Training S2D-Dec: meshes in, parameters out.
+"""Fit S2D-Dec to meshes.
 
-A run keeps metrics and checkpoints in a folder and goes on from there when called again. The generator of motion is
-trained apart (`facejax.fit_motion`), as OT23 4.1 does.
+A run keeps metrics and checkpoints in a folder and resumes from them. The generator of motion is trained separately
+(`fit_motion`), as in OT23 4.1.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from facejax.training import loop, metric_logger, steps
 
 
 class S2DDecPlan(NamedTuple):
-    """How S2D-Dec is trained."""
+    """Training plan of S2D-Dec."""
 
     steps: int = 12_000
     batch: int = 16
@@ -44,12 +44,9 @@ def fit(
     *,
     plan: S2DDecPlan = S2DDecPlan(),
     seed: int = 0,
-    mesh: Mesh | None = None,
+    device_mesh: Mesh | None = None,
 ) -> s2d_dec.S2DDec:
-    """Train S2D-Dec on meshes; they are read from disk batch by batch, never held whole.
-
-    `mesh` as in `training.run`.
-    """
+    """Train S2D-Dec on meshes, which are read from disk batch by batch; `device_mesh` as in `loop.run`."""
     data = meshes.data
     chosen = hashlib.sha256(meshes.indices.tobytes()).hexdigest()
     metric_logger.claim_folder(
@@ -65,7 +62,7 @@ def fit(
         marks, target = batch
         predicted = s2d_dec.apply(s2d_dec.S2DDec(scale, trained), hierarchy, marks)
         value = losses.s2d(predicted, target, weights, beta1=plan.beta1, beta2=plan.beta2, reduction=plan.reduction)
-        # The distance is for the journal alone: its gradient at a vertex that is met exactly would be NaN.
+        # The distance is logged only: its gradient at a vertex without error would be NaN.
         distance = jnp.linalg.norm(jax.lax.stop_gradient(predicted - target), axis=-1)
         return value, {"error_mm": jnp.mean(distance)}
 
@@ -78,13 +75,13 @@ def fit(
         steps=plan.steps,
         constants=(scale, jax.device_put(hierarchy), weights),
         chunk=50,
-        mesh=mesh,
+        device_mesh=device_mesh,
     )
     return s2d_dec.S2DDec(scale, state.params)
 
 
 def vertex_weights(meshes: MeshSubset, weighting: str) -> jax.Array:
-    """`losses.landmark_weights` (N,) on the mean neutral face of the meshes' subjects."""
+    """Return `losses.landmark_weights` (N,) on the mean neutral face of the meshes' subjects."""
     template = np.asarray(meshes.data.neutral[meshes.subjects], np.float64).mean(axis=0)
     return losses.landmark_weights(
         jnp.asarray(template, jnp.float32), jnp.asarray(meshes.data.landmark_index), mode=weighting,
@@ -93,12 +90,12 @@ def vertex_weights(meshes: MeshSubset, weighting: str) -> jax.Array:
 
 
 def mesh_batches(meshes: MeshSubset, batch: int, seed: int) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
-    """`batches(first, count)`: landmarks (count, B, L, 3) and vertices (count, B, N, 3), read as they are needed."""
+    """Return `batches(first, count)`: landmarks (count, B, L, 3) and vertices (count, B, N, 3), read on demand."""
     indices = loop.epoch_indices(seed, meshes.count, batch)
 
     def batches(first: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-        found = meshes.read(indices(first, count).ravel())
-        return tuple(x.reshape(count, batch, *x.shape[1:]) for x in found)
+        marks, vertices = meshes.read(indices(first, count).ravel())
+        return marks.reshape(count, batch, *marks.shape[1:]), vertices.reshape(count, batch, *vertices.shape[1:])
 
     return batches
 

@@ -102,7 +102,7 @@ def test_the_rest_of_the_project_reads_it(capture):
 
 
 def test_a_draw_of_the_meshes(capture, ball):
-    data = prepared(capture, most=50)
+    data = prepared(capture, max_meshes=50)
     assert data.vertices.shape == (50, 162, 3) and data.landmarks.shape == (132, 5, 3)
     assert np.all(np.diff(data.drawn) > 0) and len({s.subject for s in data.sequences}) == 6
     np.testing.assert_array_equal(data.vertices[:, MARKS], data.landmarks[data.drawn])
@@ -137,7 +137,7 @@ def test_without_triangles_but_in_one_file(ball, tmp_path):
     data = prepared(tmp_path / "root")
     np.testing.assert_array_equal(data.faces, ball[1])
     assert {s["split"] for s in data.index["subjects"]} == {"train"}
-    assert "nobody serves validation and test: all splits need 4 subjects or more, got 2" in data.index["notes"]
+    assert "no subjects in the splits validation and test: 4 subjects or more are needed, got 2" in data.index["notes"]
 
 
 def test_frames_and_subjects_are_in_natural_order(ball, tmp_path):
@@ -161,7 +161,7 @@ def test_a_missing_neutral_is_the_first_frame(capture, ball):
     np.savez(capture / "S3" / "anger.npz", vertices=shifted, faces=ball[1])
     data = prepared(capture)
     np.testing.assert_array_equal(data.neutral[3], shifted[0])
-    assert "no neutral mesh, at rest in the first frame of the first recording: S3" in data.index["notes"]
+    assert "no neutral mesh, used the first frame of the first recording: S3" in data.index["notes"]
 
 
 @pytest.mark.parametrize(("unit", "per"), [("metres", 1000), ("centimetres", 10), ("decimetres", 100)])
@@ -175,7 +175,7 @@ def test_units_are_recognised_and_said(capture, ball, unit, per):
 def test_a_unit_can_be_named(capture, ball):
     scaled(capture, ball, 2.0)  # 400 mm, the most that is taken for a head
     scaled(capture, ball, 1.01)
-    with pytest.raises(base.SourceError, match=r"neutral.ply: 404 in size; expected a head .* name the unit"):
+    with pytest.raises(base.SourceError, match=r"neutral.ply: size 404; expected a head .* name the unit"):
         prepared(capture)
     data = prepared(capture, unit="cm")
     assert np.ptp(data.neutral[0], axis=0).max() == pytest.approx(4040, rel=1e-3)
@@ -215,7 +215,7 @@ def test_positions_go_to_the_nearest_vertices(capture, ball):
     data = prepared(capture)
     np.testing.assert_array_equal(data.landmark_index, MARKS)
     assert data.landmark_index.dtype == np.int32
-    assert any("positions went to the nearest vertices, 0.3 mm away at most" in x for x in data.index["notes"])
+    assert any("positions moved to the nearest vertices, by 0.3 mm or less" in x for x in data.index["notes"])
     record = {"faces": [0, 5, 9, 200], "weights": [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]]}
     (capture.parent / "marks.json").write_text(json.dumps(record))
     data = folder.prepare(capture, capture.parent / "b", landmarks=capture.parent / "marks.json")
@@ -234,7 +234,7 @@ def test_what_lies_elsewhere_is_passed_over(capture, ball):
     (capture / "readme.txt").write_text("recorded on a Monday")
     data = prepared(capture)
     assert len(data.sequences) == 12
-    assert data.index["notes"][1:] == ["passed over, as meshes outside the folders of recordings: S0/scan.ply"]
+    assert data.index["notes"][1:] == ["skipped meshes outside recording folders: S0/scan.ply"]
 
 
 @pytest.mark.parametrize(
@@ -356,24 +356,24 @@ def _index(index):
         (_nan_in_a_frame, r"S2/neutral.npy: vertex 30 is not finite"),
         (_unit, r"S5/neutral.ply: 0.001 times as large as \S*S0/neutral.ply"),
         (_cut, r"S5/Big-Smile/000003.ply: "),
-        (_both, r"S1/big_smile.npz: the recording 'big_smile' is Big-Smile already"),
-        (_neutrals, r"S1: neutral.npy and neutral.ply, expected one face at rest"),
+        (_both, r"S1/big_smile.npz: duplicate recording 'big_smile', also Big-Smile"),
+        (_neutrals, r"S1: two neutral meshes, neutral.npy and neutral.ply; expected one"),
         (_formats, r"S1/Big-Smile: frames in .obj and .ply, expected one format"),
         (_one, r"S1/Big-Smile: 1 frame, expected 2 or more"),
-        (_still, r"S1/anger.npz: its landmarks never leave the face at rest"),
+        (_still, r"S1/anger.npz: the recording contains no motion"),
         (_rate, r"S1/anger.npz: fps is 60, expected 30"),
-        (lambda c, b: (c / "S1" / "empty").mkdir(), r"S1/empty: holds no frames; expected .ply, .obj, .npy, .npz"),
-        (lambda c, b: (c / "S9").mkdir(), r"S9: holds no recordings"),
-        (lambda c, b: (c / "S1" / "Neutral").mkdir(), r"S1/Neutral: the face at rest is one mesh"),
-        (lambda c, b: (c / "S1" / "a>b").mkdir(), r"S1/a>b: a recording's name cannot hold '>'"),
+        (lambda c, b: (c / "S1" / "empty").mkdir(), r"S1/empty: contains no frames; expected .ply, .obj, .npy, .npz"),
+        (lambda c, b: (c / "S9").mkdir(), r"S9: contains no recordings"),
+        (lambda c, b: (c / "S1" / "Neutral").mkdir(), r"S1/Neutral: the neutral face must be one mesh"),
+        (lambda c, b: (c / "S1" / "a>b").mkdir(), r"S1/a>b: the name of a recording must not contain '>'"),
         (lambda c, b: np.savez(c / "S1" / "x.npz", vertices=b[0]), r"S1/x.npz: vertices must be \(T, N, 3\), got"),
         (lambda c, b: np.savez(c / "S1" / "x.npz", points=b[0]), r"S1/x.npz: holds no array 'vertices'"),
         (lambda c, b: (c / "S1" / "x.npz").write_bytes(b"PK cut"), r"S1/x.npz: "),
         (_index([0, 1, 2, 162]), r"marks.json: indices\[3\]: 162 is out of range; vertices are 0..161"),
         (_index([0, 1, 2]), r"marks.json: 3 landmarks, expected 4 or more"),
         (lambda c, b: (c.parent / "marks.json").unlink(), r"marks.json: no such file"),
-        (lambda c, b: (c.parent / "store").mkdir(), r"store: is there already"),
-        (lambda c, b: (c.parent / "store").symlink_to("nowhere"), r"store: is there already"),
+        (lambda c, b: (c.parent / "store").mkdir(), r"store: already exists"),
+        (lambda c, b: (c.parent / "store").symlink_to("nowhere"), r"store: already exists"),
     ],
 )
 def test_what_is_wrong_is_named_and_nothing_is_written(capture, ball, damage, message):
@@ -395,12 +395,12 @@ def test_requests_that_cannot_be_met(capture, ball, tmp_path):
     (tmp_path / "file").write_text("here")
     assert "nowhere: no such folder" in told(tmp_path / "nowhere", tmp_path / "o")
     assert "file: not a folder" in told(tmp_path / "file", tmp_path / "o")
-    assert "Big-Smile: holds no recordings" in told(capture / "S0", tmp_path / "o")  # one folder too deep
-    assert "Big-Smile: holds no folders" in told(capture / "S0" / "Big-Smile", tmp_path / "o")
-    assert "lies among the meshes" in told(capture, capture / "S0" / "store")
+    assert "Big-Smile: contains no recordings" in told(capture / "S0", tmp_path / "o")  # one folder too deep
+    assert "Big-Smile: contains no folders" in told(capture / "S0" / "Big-Smile", tmp_path / "o")
+    assert "is inside the source folder" in told(capture, capture / "S0" / "store")
     assert f"{tmp_path / 'file'} is not a folder" in told(capture, tmp_path / "file" / "deeper" / "store")
     assert "rate: expected frames per second" in told(capture, tmp_path / "o", rate=float("nan"))
-    assert "(--meshes): expected 1 mesh" in told(capture, tmp_path / "o", most=0)
+    assert "(--meshes): expected 1 or more" in told(capture, tmp_path / "o", max_meshes=0)
     point = tmp_path / "point"
     (point / "S0").mkdir(parents=True)
     np.savez(point / "S0" / "a.npz", vertices=np.ones((3, 162, 3)), faces=ball[1])

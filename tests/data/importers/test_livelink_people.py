@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facejax.data import motions
+from facejax.data import blendshapes, motions
 from facejax.data.importers import base, registry
 from facejax.data.synthetic import makehuman, rig
 from facejax.io import livelink
@@ -30,9 +30,9 @@ def test_every_performer_plays_people_of_their_own(takes, tmp_path):
         (i, "mouth_open", n) for i in range(4) for n in (36, 38)
     ]
     # What the rig makes of the recording's weights above rest.
-    even = livelink.resample(livelink.subtract_rest(livelink.read(takes / "ben" / "mouth_open_01.csv")), rate=30)
+    even = blendshapes.resample(blendshapes.subtract_rest(livelink.read(takes / "ben" / "mouth_open_01.csv")), rate=30)
     person = makehuman.subject(1)
-    posed = rig.pose(rig.build(person, level=1), livelink.unit_weights(even, rig.unit_names()))[
+    posed = rig.pose(rig.build(person, level=1), blendshapes.unit_weights(even, rig.unit_names()))[
         :, : len(person.vertices)
     ]
     first = data.sequences[2].start
@@ -55,5 +55,5 @@ def test_recordings_without_performers_and_what_is_wrong(tmp_path):
     with pytest.raises(base.SourceError, match=r"jaw.csv: line 6"):
         registry.scan("livelink", root)
     (root / "jaw.csv").unlink()
-    with pytest.raises(base.SourceError, match="holds no recordings"):
+    with pytest.raises(base.SourceError, match="contains no recordings"):
         registry.scan("livelink", root)

@@ -99,7 +99,7 @@ def test_vocaset_comes_back_exactly(capture, marks, tiny_store):
 def test_bu3dfe_leaves_out_who_has_no_neutral_mesh(capture, marks, tiny_store):
     data = prepared(capture("bu3dfe"), marks)
     assert [(s["name"], s["sex"]) for s in data.index["subjects"]] == [("F0001", "female"), ("M0001", "male")]
-    assert any("1 of 3 people have no neutral mesh and are left out: F0002" in n for n in data.index["notes"])
+    assert any("skipped 1 of 3 people without a neutral mesh: F0002" in n for n in data.index["notes"])
     strengths = (0, 0.25, 0.5, 0.75, 1.0)
     moved = np.concatenate([motion(tiny_store, s, e, strengths) for s in (0, 2) for e in range(2)])
     np.testing.assert_array_equal(data.vertices, millimetres(moved, 1))
@@ -117,7 +117,7 @@ def test_bu4dfe_has_landmarks_alone(tmp_path, tiny_store):
     assert data.index["rate"] == 25 and data.labels == ("neutral", "angry", "happy")
     halves = motions.halves(data, "train")
     assert halves.curves.shape == (8, 30, 83, 3)
-    with pytest.raises(dataset.DatasetError, match="holds landmarks alone, expected meshes"):
+    with pytest.raises(dataset.DatasetError, match="contains only landmarks, expected meshes"):
         dataset.open_meshes(data.path)
     with pytest.raises(ValueError, match="holds landmarks alone"):
         fit_bundle.check(data)
@@ -129,29 +129,41 @@ def test_tables_beside_a_dataset(capture, marks, tiny_store):
     (folder / "people.csv").write_text("subject,split,age\nsubject0,test,30\n\nsubject1,train,40\n")
     header = "subject,recording,onset,apex_start,apex_end,offset\n"
     (folder / "cuts.csv").write_text(f"{header}subject1,1+2,0,3,6,8\n")
-    tables = {name: folder / f"{name}.csv" for name in ("labels", "people", "cuts")}
+    tables = {"labels": folder / "labels.csv", "people": folder / "people.csv", "phases": folder / "cuts.csv"}
     data = prepared(root, marks, **tables)
     assert [s.label for s in data.sequences] == ["1+2", "12+25", "grin", "1+2", "12+25", "12+25"]
     assert [s[4:8] for s in data.sequences] == [(1, 4, 5, 7)] * 3 + [(0, 3, 6, 8)] + [(1, 4, 5, 7)] * 2
     assert data.people() == {"train": ["subject1"], "validation": [], "test": ["subject0"]}
     assert [s["age"] for s in data.index["subjects"]] == ["30", "40"]
     for name, text, message in (
-        ("cuts", f"{header}subject1,1+3,0,3,6,8\n", "cuts.csv: line 2: no recording '1[+]3' of 'subject1'"),
-        ("cuts", f"{header}subject1,1+2,0,3,6,9\n", "cuts.csv: line 2: expected frames that rise from 0 to 8"),
-        ("cuts", f"{header}subject1,1+2,0,x,6,8\n", "cuts.csv: line 2: apex_start: expected a whole number, got 'x'"),
-        ("cuts", f"{header}subject1,1+2,3,3,6,6\n", "cuts.csv: line 2: neither a way to the apex nor back"),
-        ("cuts", "subject,recording,onset\n", "cuts.csv: expected a row of names and rows of values, got 1"),
+        ("cuts", f"{header}subject1,1+3,0,3,6,8\n", "cuts.csv: line 2: subject 'subject1' has no recording '1[+]3'"),
+        (
+            "cuts",
+            f"{header}subject1,1+2,0,3,6,9\n",
+            r"cuts.csv: line 2: onset, .* must be ascending frame numbers in 0\.\.8, got \[0, 3, 6, 9\]",
+        ),
+        ("cuts", f"{header}subject1,1+2,0,x,6,8\n", "cuts.csv: line 2: apex_start: expected an integer, got 'x'"),
+        (
+            "cuts",
+            f"{header}subject1,1+2,3,3,6,6\n",
+            "cuts.csv: line 2: onset equals apex_start and apex_end equals offset",
+        ),
+        (
+            "cuts",
+            "subject,recording,onset\n",
+            "cuts.csv: expected a row of column names and one or more rows of values, got 1",
+        ),
         ("labels", "subject,recording,label\na,b\n", "labels.csv: line 2: 2 fields, expected 3"),
         ("labels", "subject,label\na,b\n", "labels.csv: line 1: expected columns subject, recording, label, got"),
-        ("labels", "subject,recording,label\nsubject0,1+2,\n", "labels.csv: line 2: label is empty"),
-        ("labels", "subject,recording,label\nsubject0,1+2,a>b\n", "labels.csv: line 2: a label cannot hold '>'"),
+        ("labels", "subject,recording,label\nsubject0,1+2,\n", "labels.csv: line 2: column label is empty"),
+        ("labels", "subject,recording,label\nsubject0,1+2,a>b\n", "labels.csv: line 2: a label must not contain '>'"),
         ("people", "subject,split\nsubject0,dev\n", "people.csv: line 2: split: expected train, validation, test, got"),
         ("people", "subject,sex\nsubject0,f\n", "people.csv: line 2: sex: expected female or male, got 'f'"),
-        ("people", "subject,split\nJane,test\n", "people.csv: line 2: nobody is called 'Jane'"),
+        ("people", "subject,split\nJane,test\n", "people.csv: line 2: unknown subject 'Jane'"),
     ):
         (folder / f"{name}.csv").write_text(text)
         with pytest.raises(base.SourceError, match=message):
-            prepared(root, marks, out="other", **{name: folder / f"{name}.csv"})
+            prepared(root, marks, out="other", **{"phases" if name == "cuts" else name: folder / f"{name}.csv"})
         assert not (folder / "other").exists()
 
 
@@ -181,11 +193,11 @@ def _twice(root, frame):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (_missing, r"00137_TA/cheeks_in: frame 5 is missing, after cheeks_in.000004.ply; --gaps takes"),
+        (_missing, r"00137_TA/cheeks_in: frame 5 is missing, after cheeks_in.000004.ply; use --gaps to"),
         (_cut, r"cheeks_in.000005.ply: ends early: face needs \d+ bytes, \d+ are left"),
         (_fewer, r"cheeks_in.000005.ply: 100 vertices, expected 3260 as in \S*bareteeth.000001.ply"),
         (_nan, r"cheeks_in.000005.ply: vertex 40 is not finite: \[.*nan.*\] \(1 in all\)"),
-        (_twice, r"cheeks_in.5.ply: frame 5 is cheeks_in.000005.ply already"),
+        (_twice, r"cheeks_in.5.ply: duplicate frame number 5, also of cheeks_in.000005.ply"),
     ],
 )
 @pytest.mark.parametrize("workers", [1, 2])
@@ -210,13 +222,15 @@ def test_gaps_can_be_allowed(capture, marks):
 def test_a_frame_without_a_number_and_other_steps(capture, marks):
     take = capture("d3dfacs") / "subject1" / "1+2"
     (take / "1+2_mean.ply").write_bytes((take / "1+2_7.ply").read_bytes())
-    with pytest.raises(base.SourceError, match=r"1\+2_mean.ply: has no frame number, unlike the others beside it"):
+    with pytest.raises(
+        base.SourceError, match=r"1\+2_mean.ply: name has no frame number, unlike other frames in the folder"
+    ):
         prepared(take.parents[1], marks)
     (take / "1+2_mean.ply").unlink()
     for number in (8, 10, 12, 14):
         (take / f"1+2_{number}.ply").unlink()
     found = registry.scan("folder", take.parents[1])
-    assert "frames are numbered in steps of 1, but elsewhere: subject1/1+2 (2)" in found.notes
+    assert "frame numbers increase by 1, except in: subject1/1+2 (2)" in found.notes
 
 
 def test_recordings_of_several_expressions_are_said(tmp_path, marks, tiny_store):
@@ -224,7 +238,7 @@ def test_recordings_of_several_expressions_are_said(tmp_path, marks, tiny_store)
     moved = np.concatenate([motion(tiny_store, 0, e) for e in (27, 27)])
     np.savez(tmp_path / "root" / "S0" / "rom.npz", vertices=moved, faces=tiny_store.faces)
     data = prepared(tmp_path / "root", marks, layout="folder")
-    assert any("1 of 1 recordings come home more than once" in note for note in data.index["notes"])
+    assert any("1 of 1 recordings return to rest more than once" in note for note in data.index["notes"])
 
 
 def test_landmarks_and_units_that_do_not_fit(capture, marks, tmp_path, tiny_store):
@@ -237,7 +251,7 @@ def test_landmarks_and_units_that_do_not_fit(capture, marks, tmp_path, tiny_stor
         return str(error.value)
 
     assert "bareteeth.000001.ply: 0.2" in (text := told(unit="mm")) and "another unit?" in text
-    assert "coma: its meshes need a file of landmarks" in told(landmarks=None)
+    assert "--landmarks is required by the coma importer" in told(landmarks=None)
     good = np.asarray(tiny_store.landmark_index)
     assert "workers: expected 1 or more, got 0" in told(workers=0)
     points = np.asarray(tiny_store.neutral[0])[good]
@@ -249,10 +263,10 @@ def test_landmarks_and_units_that_do_not_fit(capture, marks, tmp_path, tiny_stor
     assert "marks.json: indices[3]: 3260 is out of range; vertices are 0..3259" in told()
     marks.write_text(json.dumps({"indices": [1, 2, 3]}))
     assert "marks.json: 3 landmarks, expected 4 or more" in told()
-    assert "coma: has no --template" in told(template=tmp_path)
+    assert "--template is not supported by the coma importer" in told(template=tmp_path)
     assert "unknown layout 'comma', expected one of folder, coma" in told(layout="comma")
     (root / "Jane").mkdir()
-    assert "holds no recordings" in told()
+    assert "contains no recordings" in told()
 
 
 def test_bnd_files_that_are_damaged(tmp_path, tiny_store):
@@ -277,11 +291,11 @@ def test_a_pickle_with_a_foreign_class_is_refused_before_it_runs(capture, marks)
     good = index.read_bytes()
     index.write_bytes(b"cos\nsystem\n(S'touch " + str(root / "ran").encode() + b"'\ntR.")
     with pytest.raises(
-        base.SourceError, match=r"subj_seq_to_idx.pkl: names (os|posix).system, which is not let through"
+        base.SourceError, match=r"subj_seq_to_idx.pkl: contains (os|posix).system, which is not allowed"
     ):
         prepared(root, marks, template=root.parent / "template.ply")
     index.write_bytes(pickle.dumps(collections.Counter("no harm, but foreign")))
-    with pytest.raises(base.SourceError, match=r"names collections.Counter, which is not let through"):
+    with pytest.raises(base.SourceError, match=r"contains collections.Counter, which is not allowed"):
         prepared(root, marks, template=root.parent / "template.ply")
     assert not (root / "ran").exists()
     found = pickle.loads(good)
@@ -291,7 +305,7 @@ def test_a_pickle_with_a_foreign_class_is_refused_before_it_runs(capture, marks)
         prepared(root, marks, template=root.parent / "template.ply")
     found["FaceTalk_1_TA"]["sentence02"][3] = 9_999
     index.write_bytes(pickle.dumps(found))
-    with pytest.raises(base.SourceError, match=r"FaceTalk_1_TA/sentence02: frame 3 is row 9999, expected 0 to 35"):
+    with pytest.raises(base.SourceError, match=r"FaceTalk_1_TA/sentence02: frame 3 has row 9999, expected 0 to 35"):
         prepared(root, marks, template=root.parent / "template.ply")
 
 
@@ -303,7 +317,7 @@ def test_held_heads_come_back_to_where_they_were(tmp_path, marks, tiny_store):
     (tmp_path / "root" / "S0").mkdir(parents=True)
     np.savez(tmp_path / "root" / "S0" / "smile.npz", vertices=moved @ turn + [0, 3, 1], faces=tiny_store.faces)
     loose = prepared(tmp_path / "root", marks, layout="folder", out="loose")
-    held = prepared(tmp_path / "root", marks, layout="folder", out="held", hold=True)
+    held = prepared(tmp_path / "root", marks, layout="folder", out="held", remove_head_motion=True)
     off = [np.linalg.norm(np.diff(d.vertices[:, 3000], axis=0), axis=1).sum() for d in (loose, held)]
     true = moved + [0, 3, 1]
     np.testing.assert_allclose(held.vertices, true, atol=0.5)  # of 20 mm: the lip moves what should stay put a little
@@ -313,7 +327,9 @@ def test_held_heads_come_back_to_where_they_were(tmp_path, marks, tiny_store):
 def test_landmarks_that_are_no_face_are_said(capture, marks, tiny_store):
     marks.write_text(json.dumps({"indices": np.asarray(tiny_store.landmark_index)[::-1].tolist()}))
     data = prepared(capture("coma"), marks)
-    assert any("its 68 landmarks do not form a face" in note and "as they are" in note for note in data.index["notes"])
+    assert any(
+        "its 68 landmarks do not form a face" in note and "used without changes" in note for note in data.index["notes"]
+    )
 
 
 def test_jumps_are_named():
@@ -393,7 +409,7 @@ def test_another_request_does_not_go_on_with_what_was_done(capture, marks, tmp_p
         prepared(root, marks)
     assert len(list((tmp_path / ".store.part" / "done").iterdir())) == 2
     monkeypatch.setattr(worker, "import_recording", lambda job, number: (seen.append(number), real(job, number)))
-    prepared(root, marks, most=20)
+    prepared(root, marks, max_meshes=20)
     assert seen[3:] == [0, 1, 2, 3, 4, 5]
 
 
@@ -423,5 +439,5 @@ def test_notes_of_a_mean_rest(capture, marks):
     data = prepared(capture("coma"), marks, rest="mean")
     first = [np.mean([data.vertices[(3 * s + e) * FRAMES] for e in range(3)], axis=0) for s in range(2)]
     np.testing.assert_allclose(data.neutral, first, atol=1e-4)
-    assert any("at rest in the mean of the first frames" in note for note in data.index["notes"])
+    assert any("used the mean of the first frames" in note for note in data.index["notes"])
     assert data.index["version"] == ingest.VERSION

@@ -105,7 +105,7 @@ def test_told_of_noise_it_trusts_landmarks_less(params, person):
     with pytest.raises(ValueError, match="expected one or more frames of finite numbers"):
         gpmm_residual.apply(params, marks[:0], neutral, noise=None)
     assert gpmm_residual.apply(params, marks[:0], neutral).shape == (0, *neutral.shape)
-    with pytest.raises(ValueError, match="kept as one map"):
+    with pytest.raises(ValueError, match="stores only a linear map fitted to noise-free landmarks"):
         gpmm.with_landmark_noise(
             params.base._replace(statistics=linear.LinearMap(jnp.zeros((5, 3)), jnp.zeros((162, 3)), ())), 0.5
         )

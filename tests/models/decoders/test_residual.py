@@ -28,7 +28,7 @@ def scale():
 
 @cache
 def blank():
-    init = partial(residual.init, hierarchy=HIERARCHY, scale=scale(), channels=CHANNELS, mixed=MIXED)
+    init = partial(residual.init, hierarchy=HIERARCHY, scale=scale(), channels=CHANNELS, width=MIXED)
     return jax.jit(init)(jax.random.key(0))
 
 

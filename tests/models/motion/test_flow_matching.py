@@ -193,9 +193,11 @@ def test_the_flow_learns_both_styles(rank):
         source = jax.vmap(flow_matching.sample_source, (None, 0, 0, 0, 0))(chart, keys, *condition)
         target = jax.vmap(flow_matching.to_state, (None, 0))(chart, found)
         unit = jax.vmap(flow_matching.state_std, (None, 0, 0))(chart, *condition[:2])
-        field = lambda state, time, one: flow_matching.velocity(
-            flow_matching.FlowMatching(chart, weights), state, time, *one
-        )  # noqa: E731
+        params = flow_matching.FlowMatching(chart, weights)
+
+        def field(state, time, one):
+            return flow_matching.velocity(params, state, time, *one)
+
         return losses.flow_matching(field, b, source, target, condition, unit), {}
 
     optimiser = optax.adam(optax.cosine_decay_schedule(3e-3, 2000))

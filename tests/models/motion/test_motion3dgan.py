@@ -203,7 +203,7 @@ def test_output_is_tangent_and_samples_have_unit_norm(generator):
 def test_untrained_generator_has_the_right_means_and_spreads(chart):
     params = motion3dgan.generator.init(jax.random.key(0), chart, config=CONFIG)
     noise = jax.random.normal(jax.random.key(1), (4000, CONFIG.noise))
-    got = jax.vmap(motion3dgan.generator.inner, (None, 0, None, None, None))(params, noise, 2, 0, 0 * POSE)
+    got = jax.vmap(motion3dgan.generator.apply_coordinates, (None, 0, None, None, None))(params, noise, 2, 0, 0 * POSE)
     np.testing.assert_allclose(got[:, 2:].mean(0), chart.mean[2, 0], atol=0.06 * float(chart.scale[2, 0].max()))
     np.testing.assert_allclose(got[:, 2:6].std(0), chart.scale[2, 0, :4], rtol=0.06)
     np.testing.assert_allclose(got[:, :2].mean(0), 0, atol=0.06)
@@ -261,7 +261,7 @@ def test_critic_gradient_along_the_tangent_is_the_one_in_coordinates(critic):
     v, w = critic.chart.basis[0] * 0.3, jnp.float32(0.2)
     tangent = jax.grad(motion3dgan.critic.apply, 1)(critic, v, w, w, 0, 1, 0 * POSE)
     values = tangent_pca.encode(critic.chart, v, w, w, 0, 1)
-    inner = jax.grad(motion3dgan.critic.inner, 1)(critic, values, 0, 1, 0 * POSE)
+    inner = jax.grad(motion3dgan.critic.apply_coordinates, 1)(critic, values, 0, 1, 0 * POSE)
     np.testing.assert_allclose(np.linalg.norm(tangent), np.linalg.norm(inner[2:]), rtol=1e-5)
 
 
@@ -329,12 +329,12 @@ def test_the_game_learns_spread_amplitude_and_both_styles():
         (motion3dgan.generator, motion3dgan.critic), jax.random.split(jax.random.key(0)), strict=True))  # fmt: skip
 
     def generate(weights, chart, key, pair):
-        return motion3dgan.generator.inner(
+        return motion3dgan.generator.apply_coordinates(
             motion3dgan.Motion3DGAN(chart, weights), jax.random.normal(key, (16,)), *pair
         )
 
     def score(weights, chart, values, pair):
-        return motion3dgan.critic.inner(motion3dgan.Motion3DGAN(chart, weights), values, *pair)
+        return motion3dgan.critic.apply_coordinates(motion3dgan.Motion3DGAN(chart, weights), values, *pair)
 
     adam = optax.adam(optax.cosine_decay_schedule(1e-3, 2000), b1=0.5, b2=0.9)
     players = steps.Players(adam, optax.adam(1e-3, b1=0.5, b2=0.9))

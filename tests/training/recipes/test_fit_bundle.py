@@ -88,8 +88,8 @@ def test_what_cannot_be_learnt_from_is_named(tiny_store):
 def test_the_command_trains_and_says_what_it_made(few, tiny_store, tmp_path, monkeypatch, capsys):
     given = {}
 
-    def fit(data, folder, *, plans, seed, mesh):
-        assert mesh is None  # of one device
+    def fit(data, folder, *, plans, seed, device_mesh):
+        assert device_mesh is None  # of one device
         given.update(data=data.path, folder=folder, plans=plans, seed=seed)
         return pipeline.load()
 
