@@ -33,7 +33,7 @@ def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, c
     """
     tau = jax.random.uniform(key, (jax.tree.leaves(real)[0].shape[0],))
 
-    def squared_slope(tau, real, fake, condition):
+    def squared_slope(tau: jax.Array, real: Sample, fake: Sample, condition: Condition) -> jax.Array:
         between = jax.tree.map(lambda r, f: (1.0 - tau) * r + tau * f, real, fake)
         slope = jax.grad(score)(between, condition)
         return sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(slope))
@@ -81,7 +81,7 @@ def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
 
 
 def flow_matching(
-    field: Callable, key: jax.Array, source: Sample, target: Sample, condition: Condition, scale: jax.Array
+    field: Callable[..., Any], key: jax.Array, source: Sample, target: Sample, condition: Condition, scale: jax.Array
 ) -> jax.Array:
     """Return the mean squared error of a velocity field against geodesics between samples of source and target.
 

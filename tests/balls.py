@@ -1,4 +1,4 @@
-"""A dataset in memory that is learnt in no time: uneven balls of 162 vertices."""
+"""A small dataset in memory, for fast training: deformed spheres of 162 vertices."""
 
 import numpy as np
 import trimesh
@@ -7,11 +7,12 @@ from facejax.data import dataset
 from facejax.mesh import deformation_transfer
 
 
-def store_of_balls():
-    """Four expressions of 9 frames each.
+def make_ball_dataset():
+    """Return a dataset of six subjects with four expressions of 9 frames each, and five landmarks.
 
-    Five landmarks; subjects 0, 2, 4 and 5 train, 3 validates, 1 tests. Expressions are bumps carried from ball to ball,
-    and far from the landmarks also the square of how strong they are, which no linear map can follow.
+    Subjects 0, 2, 4 and 5 are in the training split, 3 in validation, 1 in test. Expressions are bumps transferred
+    between the spheres; far from the landmarks they also contain a term quadratic in the intensity, which no linear map
+    can represent.
     """
     rng = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(subdivisions=2)
@@ -22,7 +23,7 @@ def store_of_balls():
     def bump(centre, width):
         return np.exp(-np.sum((vertices - vertices[centre]) ** 2, axis=1) / (2 * width**2))
 
-    # Each expression mixes bumps around landmarks, and has one at the vertex that is farthest from all of them.
+    # Each expression combines bumps around landmarks with one at the vertex farthest from all of them.
     bumps = np.stack([bump(mark, 20.0)[:, None] * rng.normal(size=3) for mark in marks])
     mixed = np.einsum("em,mnx->enx", rng.normal(size=(len(labels), len(marks))), 3 * bumps)
     far = np.argmax(np.linalg.norm(vertices[:, None] - vertices[marks], axis=-1).min(axis=1))

@@ -6,12 +6,17 @@ import subprocess
 from pathlib import Path
 
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 import trimesh
 
-from facejax.data.synthetic import makehuman, makehuman4d
-from tests import balls
+# Modules whose shape annotations are checked when tests run; before anything of facejax is imported.
+TYPED = ["facejax.geometry.host", "facejax.mesh.normals"]
+jaxtyping.install_import_hook(TYPED, "beartype.beartype")
+
+from facejax.data.synthetic import makehuman, makehuman4d  # noqa: E402
+from tests import balls  # noqa: E402
 
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 # WebGL without a graphics card, and no talk with anybody's servers.
@@ -53,7 +58,7 @@ def tiny_store(tiny_spec, tmp_path_factory):
 @pytest.fixture(scope="session")
 def ball_store():
     """A dataset in memory that is learnt in no time, see `tests.balls`."""
-    return balls.store_of_balls()
+    return balls.make_ball_dataset()
 
 
 @pytest.fixture

@@ -217,7 +217,7 @@ def test_select_on_ties_gives_the_lower_indices():
 @pytest.mark.parametrize(
     ("call", "match"),
     [
-        (lambda p, k: augment.prototypes(p, k, classes=3), r"every class at least once, got none of \[2\]"),
+        (lambda p, k: augment.prototypes(p, k, classes=3), r"every class at least once, got none of classes \[2\]"),
         (lambda p, k: augment.prototypes(p, k, classes=1), r"\[0, 1\), got 0 to 1"),
         (lambda p, k: augment.prototypes(p, k[:1], classes=2), r"integers \(2,\)"),
         (lambda p, k: augment.prototypes(p[0], k, classes=2), r"peaks: expected \(K, L, 3\)"),

@@ -93,7 +93,7 @@ def test_wrong_shapes_and_options_are_named():
         losses.s2d(PREDICTED, TARGET, WEIGHTS, reduction="sum")
     with pytest.raises(ValueError, match=r"mode: expected .*, got 'square'"):
         losses.landmark_weights(jnp.zeros((7, 3)), jnp.arange(2), mode="square")
-    with pytest.raises(ValueError, match="needs edge_length"):
+    with pytest.raises(ValueError, match="edge_length: mode 'inverse' needs"):
         losses.landmark_weights(jnp.zeros((7, 3)), jnp.arange(2), mode="inverse")
     with pytest.raises(ValueError, match=r"vertices: expected shape \(N, 3\), got \(7, 2\)"):
         losses.landmark_weights(jnp.zeros((7, 2)), jnp.arange(2))

@@ -33,8 +33,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from scipy.linalg import lapack
-from scipy.spatial import cKDTree
+from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
 from scipy.spatial.distance import cdist
 
 COINCIDENT = 1e-6  # of the landmarks' extent: nearer landmarks coincide, flatter sets are coplanar
@@ -100,7 +101,8 @@ def fit(
         terms = np.concatenate([np.ones((len(rest), 1)), centres], axis=1)
         system = np.block([[system, terms], [terms.T, np.zeros((4, 4))]])
     wanted = np.eye(len(system), len(rest))
-    _, _, inverse, info = lapack.dgesv(system, wanted)  # LU, as in the paper
+    # LU, as in the paper
+    _, _, inverse, info = lapack.dgesv(system, wanted)  # pyright: ignore[reportAttributeAccessIssue]
     missed = np.inf if info else np.abs(system @ inverse - wanted).max()
     if not missed < EXACT:
         raise ValueError(
@@ -147,7 +149,7 @@ def apply(fit: Rbf, displacements: jax.Array, vertices: np.ndarray) -> jax.Array
     return warp(_spread(fit, _points(vertices, "vertices"), np.float32), displacements)
 
 
-def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **options) -> np.ndarray:
+def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **options: Any) -> np.ndarray:
     """Return displacements (T, N, 3) float32 with a new system for every frame, as in Seo & Luo (2021).
 
     Each step is interpolated from the previous positions of the landmarks (L, 3), displaced from rest by (T, L, 3), at
@@ -180,7 +182,7 @@ def _spread(fit: Rbf, vertices: np.ndarray, dtype: type) -> jax.Array:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _spread_on(kernel: str, dtype: type, fit: tuple, vertices: jax.Array) -> jax.Array:
+def _spread_on(kernel: str, dtype: type, fit: tuple[Any, ...], vertices: jax.Array) -> jax.Array:
     centres, origin, unit, inverse = fit
     points = (vertices - origin) / unit
     # Not |v|^2 - 2 v.c + |c|^2 by a product, which cancels at the landmarks.
@@ -228,7 +230,7 @@ KERNELS = {
 
 def _points(points: np.ndarray, name: str) -> np.ndarray:
     """Return points as (K, 3) float64; raises for another shape, a tracer, and the first row that is not finite."""
-    if isinstance(points, jax.core.Tracer):
+    if isinstance(points, Tracer):
         raise ValueError(
             f"{name}: expected concrete values, got a tracer; compute `weights` outside jit and `warp` inside"
         )

@@ -20,6 +20,7 @@ is NaN; a point that is zero, the SRVF of a constant curve, has logarithm and di
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -142,7 +143,7 @@ def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = N
     _check_set(qs)
     if steps < 1:
         raise ValueError(f"steps: expected at least 1, got {steps}")
-    tolerance = 16 * jnp.finfo(qs.dtype).eps if tolerance is None else tolerance
+    tolerance = float(16 * jnp.finfo(qs.dtype).eps) if tolerance is None else tolerance
 
     return _karcher(steps, qs, jnp.asarray(tolerance, qs.dtype))
 
@@ -263,7 +264,9 @@ def _karcher(steps: int, qs: jax.Array, tolerance: jax.Array) -> jax.Array:
 
 
 @_karcher.defjvp
-def _karcher_jvp(steps: int, primals: tuple, tangents: tuple) -> tuple[jax.Array, jax.Array]:
+def _karcher_jvp(
+    steps: int, primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]
+) -> tuple[jax.Array, jax.Array]:
     qs, tolerance = primals
     p = _karcher(steps, qs, tolerance)
 
@@ -273,8 +276,8 @@ def _karcher_jvp(steps: int, primals: tuple, tangents: tuple) -> tuple[jax.Array
         u = project(p, x)
         return x - u - project(p, jax.jvp(lambda p: _pull(p, qs), (p,), (u,))[1])
 
-    def solve(matvec, b: jax.Array) -> jax.Array:
-        return jax.scipy.sparse.linalg.cg(matvec, b, tol=4 * jnp.finfo(b.dtype).eps, maxiter=100)[0]
+    def solve(matvec: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
+        return jax.scipy.sparse.linalg.cg(matvec, b, tol=float(4 * jnp.finfo(b.dtype).eps), maxiter=100)[0]
 
     # pull(p, qs) = 0, differentiated: hessian(dp) = d pull / d qs. A bare `cg` cannot be transposed under jit
     # (it ties its starting point to b), so the linear solve is declared around it.

@@ -78,7 +78,7 @@ def from_labels(
 
 
 def from_recording(recording: livelink.Recording, *, name: str) -> Motion:
-    """Return the landmark motion of the average face that plays an evenly sampled recording (`blendshapes.resample`)."""
+    """Return the landmark motion of the average face playing an evenly sampled recording (`blendshapes.resample`)."""
     person, marks = makehuman.average(), makehuman.template().landmarks
     rest = person.vertices[marks]
     scale = float(np.linalg.norm(rest - rest.mean(axis=0)))

@@ -54,7 +54,7 @@ def build(
     lengths: Sequence[int | None] | int | None = LENGTHS,
     reference: int | None = None,
     dilation: int = 1,
-    cache: str | os.PathLike | None = None,
+    cache: str | os.PathLike[str] | None = None,
 ) -> Hierarchy:
     """Build the hierarchy of a template.
 

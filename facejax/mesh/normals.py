@@ -11,6 +11,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Integer
 
 from facejax.geometry.sphere import safe_sqrt
 
@@ -18,7 +20,9 @@ SHORTEST = 1e-20  # a sum of normals times double areas that is no longer has no
 
 
 @jax.jit
-def vertex_normals(vertices: jax.Array, faces: jax.Array) -> jax.Array:
+def vertex_normals(
+    vertices: Float[Array | np.ndarray, "*batch N 3"], faces: Integer[Array | np.ndarray, "F 3"]
+) -> Float[Array, "*batch N 3"]:
     """Return the unit normals (..., N, 3) of vertices (..., N, 3) with triangles (F, 3).
 
     A normal is 0 where the adjacent triangles have no area, where their normals cancel to rounding, and at a vertex
@@ -35,7 +39,9 @@ def vertex_normals(vertices: jax.Array, faces: jax.Array) -> jax.Array:
     return unit_or_zero(mean, norm(mean), jnp.finfo(mean.dtype).eps * area)
 
 
-def vertex_normals_host(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_normals_host(
+    vertices: Float[np.ndarray, "*batch N 3"], faces: Integer[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "*batch N 3"]:
     """Return the unit normals (..., N, 3) of vertices (..., N, 3), float32 or float64, in their dtype; see the module.
 
     Edges are computed in the dtype of the vertices, products and sums in float64. A normal is 0 where the sum of the
@@ -53,7 +59,9 @@ def vertex_normals_host(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(length > SHORTEST, total / np.maximum(length, SHORTEST), np.zeros((), total.dtype))
 
 
-def triangle_normals(first: jax.Array, second: jax.Array) -> tuple[jax.Array, jax.Array]:
+def triangle_normals(
+    first: Float[Array | np.ndarray, "*batch 3"], second: Float[Array | np.ndarray, "*batch 3"]
+) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 1"]]:
     """Return unit normals (..., 3) and double areas (..., 1) of triangles with edges (..., 3) from one corner.
 
     Both are 0 where the area is below the rounding error of a product of two edges: in float32, for a triangle ten
@@ -66,7 +74,9 @@ def triangle_normals(first: jax.Array, second: jax.Array) -> tuple[jax.Array, ja
     return unit, jnp.where(jnp.any(unit != 0, axis=-1, keepdims=True), double, 0)
 
 
-def unit_or_zero(vectors: jax.Array, size: jax.Array, least: jax.Array) -> jax.Array:
+def unit_or_zero(
+    vectors: Float[Array, "*batch 3"], size: Float[Array, "*batch 1"], least: ArrayLike
+) -> Float[Array, "*batch 3"]:
     """Return vectors (..., 3) divided by their `norm`, `size` (..., 1); 0 where the size is at most `least`."""
     limits = jnp.finfo(vectors.dtype)
     # The squares of shorter vectors are denormal numbers, which have lost digits.
@@ -74,7 +84,7 @@ def unit_or_zero(vectors: jax.Array, size: jax.Array, least: jax.Array) -> jax.A
     return jnp.where(kept, vectors / jnp.where(kept, size, 1), 0)
 
 
-def norm(vectors: jax.Array) -> jax.Array:
+def norm(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 1"]:
     """Return the norm (..., 1) of vectors (..., 3), with gradient 0 at 0."""
     return safe_sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
 

@@ -13,6 +13,7 @@ mouth from 1.20 to 0.59 mm (`experiments.rbf_warp`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -103,7 +104,11 @@ def upper_lip_share(
 
 
 def split_lips(
-    vertices: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]], share: np.ndarray, **options
+    vertices: np.ndarray,
+    landmarks: np.ndarray,
+    lips: tuple[Sequence[int], Sequence[int]],
+    share: np.ndarray,
+    **options: Any,
 ) -> np.ndarray:
     """Return weights (N, L) float32 blended from two fits, one without the lower and one without the upper lip.
 
@@ -124,7 +129,7 @@ def weights(
     *,
     lips: tuple[Sequence[int], Sequence[int]] | None = None,
     reach: float = REACH,
-    **options,
+    **options: Any,
 ) -> np.ndarray:
     """Return weights (N, L) float32 for `geometry.rbf.warp` of a face at rest, with falloff and separate lips.
 

@@ -177,7 +177,12 @@ def test_own_meshes_become_a_dataset(capsys, tmp_path, capture):
     options = ("--root", root, "--landmarks", marks, "--out", tmp_path / "o" / "own")
     code, printed, err = run(capsys, "data", "prepare", "folder", *options, "--fps", 60)
     assert code == 0 and printed == f"{tmp_path / 'o' / 'own'}\n", err
-    assert "read as metres" in err and "no neutral mesh" in err and "nobody serves validation and test" in err
+    assert (
+        "read as metres" in err
+        and "no neutral mesh" in err
+        and "4 subjects or more are needed, got 1" in err
+        and "validation and test" in err
+    )
     data = dataset.open_dataset(tmp_path / "o" / "own")
     assert data.labels == ("neutral", "big_smile") and data.index["rate"] == 60
     assert [*data.index["notes"], "train: S1"] == err.splitlines()
@@ -199,7 +204,9 @@ def test_bad_requests_for_own_meshes_get_one_line(capsys, tmp_path, capture):
     (root / "S1" / "big smile" / "000004.ply").write_bytes(b"ply")
     assert "big smile/000004.ply" in told("--landmarks", marks, "--unit", "m")
     (root / "S1" / "big smile" / "000004.ply").unlink()
-    assert "big smile: frame 4 is missing, after 000003.ply; --gaps takes" in told("--landmarks", marks)
+    assert "big smile: frame 4 is missing, after 000003.ply; use --gaps to import the existing frames" in told(
+        "--landmarks", marks
+    )
     assert "--template is not supported by the folder importer" in told("--landmarks", marks, "--template", marks)
     assert {path.name for path in tmp_path.iterdir()} == {"root", "marks.json"}
 

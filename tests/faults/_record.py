@@ -1,7 +1,7 @@
-"""How often each fault was tried, and what came of it; docs/faults.md shows the table.
+"""Records of how often each fault was tried, and the outcomes; docs/faults.md shows the table.
 
-FACEJAX_FAULT_TRIES and FACEJAX_FAULT_FILES are set by `make faults`; without them few are tried. Outcomes are added to
-the file that FACEJAX_FAULT_RECORD names.
+FACEJAX_FAULT_TRIES and FACEJAX_FAULT_FILES are set by `make faults`; by default only a few tries are made. Outcomes are
+appended to the file that FACEJAX_FAULT_RECORD names.
 """
 
 from __future__ import annotations

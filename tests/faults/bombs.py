@@ -1,7 +1,7 @@
-"""Files that are large on purpose: `python tests/faults/bombs.py BOMB FOLDER` reads one, and prints its peak in MB.
+"""Files made to exhaust memory: `python tests/faults/bombs.py BOMB FOLDER` reads one and prints the peak in MB.
 
-Each takes many times its size where it is read without care: a text of many numbers, polygons of many corners, lists of
-empty lists, archives of nothing, headers that claim what is not there.
+A careless reader needs many times the file's size: texts of many numbers, polygons of many corners, lists of empty
+lists, archives of empty members, headers that declare more data than the file contains.
 """
 
 import json

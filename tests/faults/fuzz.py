@@ -1,9 +1,8 @@
 """Damaged files for a reader: `python tests/faults/fuzz.py READER --files N --seed S` prints one JSON line.
 
-Small whole files are changed at random: bytes flipped, cut, copied, blanked, numbers exchanged for huge, negative and
-senseless ones. In an NPZ the arrays are, and then zipped anew, so that no checksum stands before the reader. A reader
-may refuse a file by the error that it promises, or take it; anything else is a crash. What lies beside the file must
-not change.
+Small valid files are mutated at random: bytes are flipped, cut, copied or blanked, numbers replaced by huge, negative
+and invalid ones. In an NPZ the arrays are mutated and zipped again, so that checksums are valid. A reader may reject a
+file with its documented error, or accept it; any other exception is a crash. Other files must not change.
 """
 
 import argparse
@@ -271,7 +270,7 @@ def _write_glb(path: Path) -> None:
 
 
 def run(name: str, count: int, seed: int) -> dict:
-    """How often a reader took, refused and crashed."""
+    """Count how often a reader accepted, rejected and crashed."""
     reader, rng = readers()[name](), random.Random(f"{name} {seed}")
     outcome = {"reader": name, "files": count, "taken": 0, "refused": 0, "crashed": [], "slowest_s": 0.0}
     with tempfile.TemporaryDirectory() as root:

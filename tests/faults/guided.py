@@ -1,9 +1,9 @@
-"""Damaged files that are sought out by what they make a reader do: `python tests/faults/guided.py READER --seconds N`.
+"""Coverage-guided fuzzing of a reader: `python tests/faults/guided.py READER --seconds N`.
 
-Atheris watches which lines of the reader a file has led to, and changes those files further that led to new ones. By
-hand, where `pip install atheris` goes (Python 3.11 to 3.13 on Linux): the readers and what they promise are
-`tests.faults.fuzz`'s. Stops at the first crash with its trace, and leaves the file in the folder; prints one JSON line
-when the time is over.
+Atheris records which lines of the reader a file executes, and mutates those files further that execute new ones. Run it
+by hand where `pip install atheris` works (Python 3.11 to 3.13 on Linux). Readers and their errors are those of
+`tests.faults.fuzz`. Stops at the first crash with its trace, and keeps the file in the folder; prints one JSON line at
+the end of the time.
 """
 
 import argparse

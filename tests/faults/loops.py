@@ -1,7 +1,7 @@
 """Every training loop, on tiny data: `python tests/faults/loops.py LOOP FOLDER`.
 
-Prints `begun` when the first step is about to be taken, and the SHA-256 of the result when it is done. Checkpoints are
-frequent, and steps slow enough to be killed between any two.
+Prints `begun` before the first step, and the SHA-256 of the result at the end. Checkpoints are frequent, and steps slow
+enough for a kill between any two.
 """
 
 import argparse
@@ -42,7 +42,12 @@ def flow(folder, mesh):
     _, chart, examples = motions()
     plan = fit_motion.FlowPlan(steps=STEPS, batch=8)
     return fit_motion.fit_flow(
-        examples, chart, folder, plan=plan, config=flow_matching.Config(width=16, blocks=1, embedding=4), device_mesh=mesh
+        examples,
+        chart,
+        folder,
+        plan=plan,
+        config=flow_matching.Config(width=16, blocks=1, embedding=4),
+        device_mesh=mesh,
     )
 
 
@@ -59,9 +64,9 @@ def reference(folder, mesh):
 def balls():
     from facejax.data import mesh_subset
     from facejax.mesh import hierarchy as mesh_hierarchy
-    from tests.balls import store_of_balls
+    from tests.balls import make_ball_dataset
 
-    data = store_of_balls()
+    data = make_ball_dataset()
     template = data.neutral.mean(axis=0, dtype=np.float64)
     hierarchy = mesh_hierarchy.build(template, data.faces, factors=(2, 2, 2, 2), lengths=3)
     return data, mesh_subset.of_split(data, "train", size=20), hierarchy
@@ -71,7 +76,9 @@ def decoder(folder, mesh):
     from facejax.training.recipes import fit_s2d_dec
 
     _, train, hierarchy = balls()
-    return fit_s2d_dec.fit(train, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=STEPS, batch=8), device_mesh=mesh)
+    return fit_s2d_dec.fit(
+        train, hierarchy, folder, plan=fit_s2d_dec.S2DDecPlan(steps=STEPS, batch=8), device_mesh=mesh
+    )
 
 
 def residual(folder, mesh):

@@ -1,4 +1,4 @@
-"""A disk that is full: one line, nothing half-written, and what was whole before still is."""
+"""Full disks: a one-line error, no partial files, and existing files unchanged."""
 
 import os
 import resource

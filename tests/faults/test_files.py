@@ -1,4 +1,4 @@
-"""Files from strangers: whatever is in them, they are refused by name or taken, within bounds of time and memory."""
+"""Untrusted files: they are rejected with their name or accepted, within bounds of time and memory."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Killed at random moments and started again, every loop ends with the very bits of one that was left alone."""
+"""Training loops killed at random moments and restarted end with the same bits as uninterrupted ones."""
 
 import hashlib
 import json

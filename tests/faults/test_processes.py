@@ -1,4 +1,4 @@
-"""Several devices, several processes: the numbers of one device, and no waiting for those who are gone."""
+"""Several devices and processes give the results of one device, and do not wait for lost processes."""
 
 import json
 import os

@@ -155,12 +155,12 @@ def test_bad_scans_get_one_line(files, tmp_path, capsys, head):
         assert code == 2 and printed == "" and err.count("\n") == 1 and not (tmp_path / "o").exists()
         return err
 
-    assert "of which scan?" in told("generate", "--landmarks", marks, "--end", "mouth_open")
+    assert "requires --face: the scan that they belong to" in told(
+        "generate", "--landmarks", marks, "--end", "mouth_open"
+    )
     assert "grin" in told("generate", "--face", scan, "--landmarks", marks, "--end", "grin")
     io.landmarks.write(tmp_path / "mirrored.json", points=points[[3, 2, 1, 0, 4, 6, 5]])
-    assert "left and right as the subject has them?" in told(
-        "register", scan, "--landmarks", tmp_path / "mirrored.json"
-    )
+    assert "with the subject's left and right?" in told("register", scan, "--landmarks", tmp_path / "mirrored.json")
     io.landmarks.write(tmp_path / "five.json", points=points[:5])
     assert "unsupported number of landmarks: 5 (supported: 51, 66, 68, 83)" in told(
         "register", scan, "--landmarks", tmp_path / "five.json"
@@ -174,12 +174,14 @@ def test_bad_scans_get_one_line(files, tmp_path, capsys, head):
         scans.read(scan, tmp_path / "three.json")
     wrong = [*scans.SEVEN_LANDMARKS[:6], "left mouth corner"]
     io.landmarks.write(tmp_path / "wrong.json", points=points, names=wrong)
-    assert "no landmarks' names, passed over: left mouth corner" in scans.read(scan, tmp_path / "wrong.json").notes
+    assert "ignored landmarks with unknown names: left mouth corner" in scans.read(scan, tmp_path / "wrong.json").notes
     io.landmarks.write(tmp_path / "twice.json", points=points[:3], names=["nose tip", "nose tip", "chin"])
     with pytest.raises(LandmarkError, match="duplicate landmark name"):
         scans.read(scan, tmp_path / "twice.json")
     np.save(tmp_path / "bare.npy", head[1])
-    assert "has no triangles, nothing to register" in told("register", tmp_path / "bare.npy", "--landmarks", marks)
+    assert "has no triangles; expected a mesh with faces" in told(
+        "register", tmp_path / "bare.npy", "--landmarks", marks
+    )
 
 
 def test_what_there_is_to_say_of_a_fit(head):
@@ -187,10 +189,10 @@ def test_what_there_is_to_say_of_a_fit(head):
     front = faces[vertices[faces].mean(axis=1)[:, 2] > np.quantile(vertices[:, 2], 0.6)]
     half = scan_of((true, vertices, front), registration.SEVEN)
     said = scans.describe(scans.measure(half, scans.fit(half)))
-    assert "the rest of the head is a guess: the scan has no surface there" in said
+    assert "the rest of the head is extrapolated: the scan has no surface there" in said
     off = scan_of(head, registration.SEVEN)
     off = off._replace(landmarks=off.landmarks + np.where(np.arange(7) % 2, 1, -1)[:, None] * [0, 0, 8.0])
-    assert any("are they of this face?" in note for note in scans.bind_scan(off)[1])
+    assert any("are the landmarks of this face?" in note for note in scans.bind_scan(off)[1])
 
 
 def test_the_experiment(tmp_path):

@@ -154,5 +154,5 @@ def test_faces_of_different_shapes_are_named():
         ValueError, match=r"source and target .* of one shape .* got \(162, 3\), \(161, 3\) and \(162,\)"
     ):
         DeformationTransfer(face(0), face(1)[1:], FACES, anchor_weights(MOVING))
-    with pytest.raises(ValueError, match=r"a motion per vertex.* and \(161,\)"):
+    with pytest.raises(ValueError, match=r"anchors \(N,\), got .* and \(161,\)"):
         DeformationTransfer(face(0), face(1), FACES, anchor_weights(MOVING[1:]))

@@ -69,7 +69,7 @@ def test_predecessors_lead_to_the_source_and_other_components_are_unreachable():
         (SQUARE * np.nan, FAN, r"finite \(N, 3\)"),
         (SQUARE, FAN[:, :2], r"integers \(F, 3\)"),
         (SQUARE, FAN.astype(float), r"integers \(F, 3\)"),
-        (SQUARE, FAN + 1, r"corners in 0\.\.4"),
+        (SQUARE, FAN + 1, r"vertex indices in 0\.\.4"),
         (SQUARE, FAN[:0], "no face"),
         (np.vstack([SQUARE, SQUARE]), FAN, "5 unused vertices, first 5"),
     ],

@@ -95,9 +95,9 @@ def test_landmarks_on_triangles_pass_and_on_coarse_meshes_too(template, landmark
     ("move", "match"),
     [
         (lambda x: x + np.eye(68, 1, -7) * [[0, 0, 40.0]], r"landmark 7 is \d+\.?\d* off the mesh \(nearest vertex"),
-        (lambda x: 1e-3 * x, r"landmark \d+ is .* in one unit"),
-        (lambda x: 1e3 * x, r"landmark \d+ is .* in one unit"),
-        (lambda x: x[:, [2, 0, 1]], r"landmark \d+ is .* one coordinate system"),
+        (lambda x: 1e-3 * x, r"landmark \d+ is .* face, unit and"),
+        (lambda x: 1e3 * x, r"landmark \d+ is .* face, unit and"),
+        (lambda x: x[:, [2, 0, 1]], r"landmark \d+ is .* and coordinate system"),
         (lambda x: x * np.nan, r"landmarks: expected finite \(K, 3\)"),
         (lambda x: x[:, :2], r"landmarks: expected finite \(K, 3\), got \(68, 2\)"),
     ],
