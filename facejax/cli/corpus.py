@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from facejax.cli import generate, outputs, runtime
+from facejax.cli import inputs, outputs, runtime
 from facejax.cli.arguments import Generate
 from facejax.data.synthetic import assets, makehuman
 from facejax.inference import corpus, pipeline
@@ -38,5 +38,5 @@ def _faces(
         if not np.array_equal(models.face.faces, assets.load().faces):
             raise ValueError(f"{model}: expected MakeHuman's topology, which --people needs; leave out --people")
         return {who.name: who.vertices for who in map(makehuman.subject, range(people))}, []
-    vertices, notes = generate.read_neutral(face, model)
+    vertices, notes = inputs.read_neutral(face, model)
     return {"average" if face is None else face.stem: vertices}, [f"{face}: {note}" for note in notes]

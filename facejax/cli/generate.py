@@ -8,12 +8,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from facejax.cli import checks, outputs, runtime
+from facejax.cli import checks, inputs, outputs, runtime
 from facejax.cli.arguments import Generate
 from facejax.data.synthetic import assets
 from facejax.inference import motion_sources, pipeline, scans
-from facejax.io import neutral_face
-from facejax.landmarks import canonical_frame
 
 
 def run(command: Generate) -> None:
@@ -25,7 +23,7 @@ def run(command: Generate) -> None:
     assert command.end is not None  # `checks.check` has seen to it
     bound = None
     if command.landmarks is None or command.face is None:
-        neutral, notes = read_neutral(command.face, command.model)
+        neutral, notes = inputs.read_neutral(command.face, command.model)
     else:
         bound, notes = scans.bind_scan(scans.read(command.face, command.landmarks))
         neutral = bound.neutral
@@ -90,18 +88,3 @@ def generate(
         written.append(outputs.save_landmarks(path, np.asarray(landmarks), labels, frames, fps))
         advance()
     return written
-
-
-def read_neutral(path: Path | None, model: Path | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the neutral face (N, 3) of a file in the model's topology, and notes on what was assumed.
-
-    Without a path: the average face. Raises `MeshError` for a face in another topology or of unknown unit.
-    """
-    face = pipeline.load(model).face
-    if path is None:
-        return np.asarray(face.vertices), ()
-    topology = canonical_frame.Topology(
-        np.asarray(face.vertices), np.asarray(face.landmark_index), np.asarray(face.source_index)
-    )
-    found = neutral_face.read(path, topology)
-    return found.vertices, found.notes

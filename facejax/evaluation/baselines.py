@@ -66,7 +66,7 @@ class LinearFit(NamedTuple):
 
 
 class StaticTopology(NamedTuple):
-    """What methods without training need."""
+    """Topology and landmarks, all that methods without training need."""
 
     faces: np.ndarray
     landmark_index: np.ndarray

@@ -32,7 +32,7 @@ MESH_BATCH = 16  # sequences decoded in one call
 
 
 class Request(NamedTuple):
-    """What to generate."""
+    """Number, length and kind of the sequences to generate."""
 
     count: int  # of sequences  # pyright: ignore[reportIncompatibleMethodOverride]
     labels: tuple[str, ...] = ()  # of every motion; none: two different ones are drawn for each

@@ -49,7 +49,7 @@ class Registration(NamedTuple):
 
 
 class Binding(NamedTuple):
-    """How the vertices of a scan follow those of the template."""
+    """Map from template vertices to the vertices of a scan."""
 
     faces: np.ndarray  # (V, 3) the template's vertices that each scan vertex is bound to
     weights: np.ndarray  # (V, 3), decaying to zero away from the template

@@ -49,13 +49,13 @@ class Models(NamedTuple):
     about: dict[str, Any]  # provenance of the weights
 
 
-def load(path: str | os.PathLike | None = None) -> Models:
+def load(path: str | os.PathLike[str] | None = None) -> Models:
     """Read the released models, or those of a file.
 
     Raises:
       WeightsError: a file that is missing, damaged or not a facejax model.
     """
-    path = path or resources.files("facejax.assets").joinpath(RELEASED)
+    path = path or str(resources.files("facejax.assets").joinpath(RELEASED))
     about = weights.load_metadata(path)
     try:
         like = _structure(about["shapes"], about["generator"])
@@ -76,14 +76,14 @@ def load(path: str | os.PathLike | None = None) -> Models:
     return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
 
 
-def save(path: str | os.PathLike, models: Models) -> None:
+def save(path: str | os.PathLike[str], models: Models) -> None:
     """Write models to one safetensors file, with the metadata that `load` needs."""
     tree = models._asdict()
-    refined = isinstance(models.decoder, gpmm_residual.GPMMResidual)
     about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
-    about["decoder"] = REFINED if refined else S2D
+    about["decoder"] = S2D
     tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)
-    if refined:
+    if isinstance(models.decoder, gpmm_residual.GPMMResidual):
+        about["decoder"] = REFINED
         tree["decoder"] = gpmm_residual.pack(models.decoder, components=COMPONENTS)
     leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
     weights.save(path, tree, metadata=about | {"shapes": leaves})

@@ -97,9 +97,14 @@ def measure(
         basis = pca.from_covariance(moved.T @ moved)[1][:, : config.components]
     root_mean_square = max(np.sqrt(np.mean(moved**2)), 1e-12)
     about = neutral - neutral.mean(axis=0)
-    leaves = (root_mean_square, neutral.mean(axis=0), max(np.sqrt(np.mean(about**2)), 1e-12), config.carry)
-    scale = [jnp.asarray(leaf, jnp.float32) for leaf in leaves]
-    return Scale(*scale, None if basis is None else jnp.asarray(basis, jnp.float32))
+    neutral_std = max(np.sqrt(np.mean(about**2)), 1e-12)
+    return Scale(
+        jnp.asarray(root_mean_square, jnp.float32),
+        jnp.asarray(neutral.mean(axis=0), jnp.float32),
+        jnp.asarray(neutral_std, jnp.float32),
+        jnp.asarray(config.carry, jnp.float32),
+        None if basis is None else jnp.asarray(basis, jnp.float32),
+    )
 
 
 @jax.jit
@@ -228,7 +233,7 @@ def _time_major(function: Callable[..., Array], *arrays: Array) -> Array:
     return out.reshape(*lead, *out.shape[1:])
 
 
-def _check(params: ExpressionLSTM, steps: Array, name: str) -> None:
+def _check(params: ExpressionLSTM, steps: Array | np.ndarray, name: str) -> None:
     expected = params.scale.neutral_mean.shape
     if steps.ndim < 3 or steps.shape[-2:] != expected:
         raise ValueError(f"{name}: expected (..., T, {expected[0]}, 3), got {steps.shape}")

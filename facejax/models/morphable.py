@@ -205,7 +205,7 @@ def _fit(name: str, examples: np.ndarray, option: str, components: int) -> Morph
     return MorphableModel(*(jnp.asarray(x, jnp.float32) for x in fitted))
 
 
-def _apply(params: MorphableModel, name: str, coefficients: Array) -> Array:
+def _apply(params: MorphableModel, name: str, coefficients: Array | np.ndarray) -> Array:
     """Apply a model; `name` is the caller's argument name for error messages."""
     if jnp.shape(coefficients)[-1:] != params.deviation.shape:
         raise ValueError(f"{name}: expected (..., {len(params.deviation)}), got {jnp.shape(coefficients)}")

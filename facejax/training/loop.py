@@ -124,8 +124,8 @@ def run(
         return jax.lax.scan(lambda state, batch: step(state, batch, constants), state, data)
 
     # Replicated, so that any process can read the outputs.
-    out_shardings = None if device_mesh is None else sharding.replicated(device_mesh)
-    advance = jax.jit(several, donate_argnums=0, out_shardings=out_shardings)
+    layout: dict[str, Any] = {} if device_mesh is None else {"out_shardings": sharding.replicated(device_mesh)}
+    advance = jax.jit(several, donate_argnums=0, **layout)
     with _Saved(folder / "checkpoints", keep) as saved, _stop_signals() as stopped:
         if not resume and saved.latest is not None:
             raise ValueError(f"{folder} holds a run of {saved.latest} steps: resume it, or name another folder")
@@ -137,7 +137,7 @@ def run(
                 f"{folder} holds a run of {done} steps, more than {steps}: ask for more, or name another folder"
             )
         if device_mesh is not None:
-            whole, split = sharding.replicated(device_mesh), sharding.split_along(device_mesh, 1)
+            whole = sharding.replicated(device_mesh)
             state, constants = sharding.shard(state, whole), sharding.shard(constants, whole)
 
         def prepared(first: int) -> Tree:
@@ -145,7 +145,7 @@ def run(
             if device_mesh is None:
                 return data
             sharding.check_divisible(data, device_mesh, 1)
-            return sharding.shard(data, split)
+            return sharding.shard(data, sharding.split_along(device_mesh, 1))
 
         saved_at, stopping = time.monotonic(), False
         with (

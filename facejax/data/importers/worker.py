@@ -43,7 +43,7 @@ class Job(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What is kept of an imported recording besides its meshes."""
+    """The part of an imported recording that is kept besides its meshes."""
 
     curve: np.ndarray  # (T, L, 3) float32 mm
     phases: apex_detection.Phases

@@ -94,7 +94,7 @@ def clear_teeth(contact: Contact, vertices: np.ndarray) -> np.ndarray:
 
 
 def separate_lips(contact: Contact, vertices: np.ndarray) -> np.ndarray:
-    """Where the lips overlap, move both edges back by half of the overlap, and the skin behind them smoothly."""
+    """Move both edges of overlapping lips back by half of the overlap, and the skin behind them smoothly."""
     upper, lower = contact.lip_pairs.T
     gap = vertices[:, upper, 1] - vertices[:, lower, 1]
     overlap = np.maximum(contact.lip_gap - gap, 0.0)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from facejax.mesh import strain
@@ -60,7 +61,7 @@ def apply(
       ValueError: wrong shapes, a traced `neutral` (it is preprocessed on the host), or `noise` for a model that stores
         only a linear map (see `pack`).
     """
-    if isinstance(neutral, jax.core.Tracer):
+    if isinstance(neutral, Tracer):
         raise ValueError("neutral: every face is prepared on the host and cannot be traced: pass it as a constant")
     neutral = np.asarray(neutral)
     if noise is None:
@@ -73,7 +74,7 @@ def apply(
     flat = base.reshape(math.prod(lead), *base.shape[-2:])
     marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), len(params.base.landmark_index), 3)
     rest = jnp.broadcast_to(jnp.asarray(neutral, jnp.float32), flat.shape)
-    return refine(params, marks, flat, rest).reshape(*lead, *base.shape[-2:])
+    return jnp.asarray(refine(params, marks, flat, rest)).reshape(*lead, *base.shape[-2:])
 
 
 def cached_linear_map(base: gpmm.GPMM, neutral: Float[np.ndarray, "N 3"], noise: float = 0.0) -> linear.LinearMap:

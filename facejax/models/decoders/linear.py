@@ -35,7 +35,7 @@ class LinearMap(NamedTuple):
 
 
 class Model(NamedTuple):
-    """`fit(batches, *, alpha, **options)` is `solve(prepare(batches, **options), alpha=alpha)`."""
+    """Functions of a linear model; `fit(batches, *, alpha)` is `solve(prepare(batches), alpha=alpha)`."""
 
     fit: Callable[..., LinearMap]
     prepare: Callable[..., Any]

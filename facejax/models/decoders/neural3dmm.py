@@ -123,7 +123,7 @@ def encode(
 ) -> Float[Array, "B latent"]:
     """Return the latent codes (B, 16) of neutral faces."""
     scale, weights = jax.lax.stop_gradient(params.scale), params.weights
-    x = ((neutral - scale.face) / scale.face_std).transpose(1, 0, 2)
+    x = ((jnp.asarray(neutral) - scale.face) / scale.face_std).transpose(1, 0, 2)
     for conv, stencil in zip(weights["encoder"], down, strict=True):
         x = jax.nn.elu(layers.spiral_conv(conv, x, stencil))
     return layers.dense(weights["latent"], x.transpose(1, 0, 2).reshape(x.shape[1], -1))

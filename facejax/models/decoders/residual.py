@@ -108,14 +108,14 @@ def apply(
     stretch, normal = strain.strain(moved, rest, tables)
     position = (rest - scale.face[:, None]) / POSITION_MM
     embedding = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], EMBEDDING))
-    x = (displacements - scale.landmark_mean).reshape(len(base), -1) / scale.landmark_std
+    x = (jnp.asarray(displacements) - scale.landmark_mean).reshape(len(base), -1) / scale.landmark_std
     decoded = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
     x = jnp.concatenate([stretch / STRAIN, moved / DISPLACEMENT_MM, normal, position, embedding, decoded], axis=-1)
     first, second = weights["mix"]
     x = jax.nn.elu(layers.spiral_conv(first, x, hierarchy.surface))
     x = x + jax.nn.elu(layers.spiral_conv(second, x, hierarchy.surface))
     residual = READOUT * jnp.einsum("nbc,nco->nbo", x, weights["readout"]) + x @ weights["shared"]
-    return base + params.gate * scale.unit * jnp.swapaxes(residual, 0, 1)
+    return jnp.asarray(base) + params.gate * scale.unit * jnp.swapaxes(residual, 0, 1)
 
 
 def _check(

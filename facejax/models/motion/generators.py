@@ -57,7 +57,7 @@ def kind(params: Generator) -> str:
       TypeError: parameters that are not those of a generator.
     """
     for name, record in KINDS.items():
-        if isinstance(params, record):
+        if isinstance(params, record):  # pyright: ignore[reportUnnecessaryIsInstance]
             return name
     raise TypeError(f"expected the parameters of a generator, such as models.motion; got {type(params).__name__}")
 

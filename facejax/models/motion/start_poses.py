@@ -28,7 +28,7 @@ class StartPoses(NamedTuple):
     """Peaks by label, at most N each; rows beyond a label's count are zero."""
 
     poses: Array  # (K, N, D)
-    count: Array  # (K,) float, number of peaks
+    count: Array  # pyright: ignore[reportIncompatibleMethodOverride] (K,) float, number of peaks
     root: Array  # (K, D, D), a root of the label's covariance
 
 

@@ -25,7 +25,7 @@ FEEDS = ("truth", "coin", "switch")
 
 
 class ExpressionPlan(NamedTuple):
-    """How the networks are trained.
+    """Training options of the expression networks.
 
     `feed` selects the inputs in training. "truth": the recorded steps (teacher forcing, as in the paper). "coin": at
     each frame the network's own last output with a probability that grows to one (scheduled sampling, Bengio et al.

@@ -10,6 +10,7 @@ from face to face, and the strength of the smooth prior; without both the model 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -43,7 +44,8 @@ class FittedGPMM(NamedTuple):
         return found
 
 
-class _People(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _People:
     """Meshes by person; can be iterated repeatedly."""
 
     meshes: MeshSubset
@@ -99,13 +101,14 @@ def fit(
     return FittedGPMM(gpmm.GPMM(faces, at, face, overall_motion, overall_motion, known, prior), errors, folded)
 
 
-class _Displacements(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class _Displacements:
     """Meshes, optionally with their displacements replaced; can be iterated repeatedly."""
 
     meshes: MeshSubset
     moved: np.ndarray | None  # (G, N, 3); None: their own
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         first = 0
         for landmarks, vertices in self.meshes:
             yield landmarks, vertices if self.moved is None else self.moved[first : first + len(vertices)]
