@@ -39,7 +39,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     weights.save(tmp_path / "w.safetensors", {"a": np.zeros(3)}, metadata={"labels": ["x"]})
     with pytest.raises(weights.WeightsError, match="does not describe expression networks"):
         expressions.load(tmp_path / "w.safetensors")
-    with pytest.raises(weights.WeightsError, match="no weights file"):
+    with pytest.raises(weights.WeightsError, match="no such weights file"):
         expressions.load(tmp_path / "none.safetensors")
     networks = made()
     expressions.save(tmp_path / "n.safetensors", networks._replace(config=networks.config._replace(hidden=9)))

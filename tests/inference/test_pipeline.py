@@ -226,5 +226,5 @@ def test_files_that_hold_no_models_are_named(tmp_path):
     weights.save(path, {"a": np.zeros(3, np.float32)}, metadata={"shapes": {"a": ["float32", [3]]}, "generator": "gan"})
     with pytest.raises(weights.WeightsError, match="does not describe facejax models"):
         pipeline.load(path)
-    with pytest.raises(weights.WeightsError, match="no weights file"):
+    with pytest.raises(weights.WeightsError, match="no such weights file"):
         pipeline.load(tmp_path / "none.safetensors")

@@ -367,7 +367,7 @@ def _index(index):
         (lambda c, b: (c / "S1" / "Neutral").mkdir(), r"S1/Neutral: the neutral face must be one mesh"),
         (lambda c, b: (c / "S1" / "a>b").mkdir(), r"S1/a>b: the name of a recording must not contain '>'"),
         (lambda c, b: np.savez(c / "S1" / "x.npz", vertices=b[0]), r"S1/x.npz: vertices must be \(T, N, 3\), got"),
-        (lambda c, b: np.savez(c / "S1" / "x.npz", points=b[0]), r"S1/x.npz: holds no array 'vertices'"),
+        (lambda c, b: np.savez(c / "S1" / "x.npz", points=b[0]), r"S1/x.npz: contains no array 'vertices'"),
         (lambda c, b: (c / "S1" / "x.npz").write_bytes(b"PK cut"), r"S1/x.npz: "),
         (_index([0, 1, 2, 162]), r"marks.json: indices\[3\]: 162 is out of range; vertices are 0..161"),
         (_index([0, 1, 2]), r"marks.json: 3 landmarks, expected 4 or more"),
