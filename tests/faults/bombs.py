@@ -6,7 +6,6 @@ lists, archives of empty members, headers that declare more data than the file c
 
 import json
 import pickle
-import resource
 import struct
 import sys
 import zipfile
@@ -124,6 +123,15 @@ BOMBS = {
 }  # fmt: skip
 
 
+def peak_mb() -> float:
+    """Return the peak memory of this process in MB.
+
+    From /proc, which starts anew with the program: `getrusage` counts what the parent held when it forked.
+    """
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0]) / 1024
+
+
 def main() -> None:
     name, folder = sys.argv[1], Path(sys.argv[2])
     bomb = BOMBS[name]
@@ -145,7 +153,7 @@ def main() -> None:
         said = "read"
     except error as refused:
         said = str(refused)
-    print(json.dumps({"said": said, "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
+    print(json.dumps({"said": said, "peak_mb": peak_mb()}))
 
 
 if __name__ == "__main__":
