@@ -118,7 +118,7 @@ def test_without_a_predecessor_the_output_says_so(tmp_path, capsys, monkeypatch)
     found = user_study.run(user_study.Config(out=tmp_path, composed=0, peaks=1, real=0, frames=2, width=16))
     assert found["items"] == {"peak": 1}
     said = capsys.readouterr().out.splitlines()
-    assert len(said) == 2 and said[0].startswith("no --predecessor: the page goes without")
+    assert len(said) == 2 and said[0].startswith("no --predecessor: the page has no neutral → peak animations")
 
 
 def test_the_plan_is_drawn_by_seed_and_never_repeats():
@@ -147,7 +147,7 @@ def test_more_than_there_is_gets_refused(wrong):
 
 def test_a_page_that_was_answered_is_not_replaced(tmp_path):
     write(tmp_path / "scores", p=answers(P, (6, 8, 4, 10)))
-    with pytest.raises(ValueError, match=r"scores has answers to the page that is there: name another --out"):
+    with pytest.raises(ValueError, match=r"scores holds answers to an earlier page: name another --out"):
         user_study.run(user_study.Config(out=tmp_path))
     with pytest.raises(ValueError, match="width: expected 16 pixels or more, got 0"):
         user_study.run(user_study.Config(out=tmp_path, width=0))
