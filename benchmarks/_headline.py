@@ -51,7 +51,7 @@ WORKS = (
 def table(rows: Sequence[Row]) -> str:
     """Return the Markdown table of the lines that were measured."""
     known = {row["name"]: row for row in rows}
-    lines = ["| work | aim | facejax | peers |", "|" + " --- |" * 4]
+    lines = ["| work | target | facejax | peers |", "|" + " --- |" * 4]
     for work in WORKS:
         if work.name in known:
             row = known[work.name]

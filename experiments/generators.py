@@ -261,7 +261,7 @@ def _plot(out: Path, table: dict[str, dict[str, Any]], real: dict[str, Any]) -> 
         if row["energy"] > limit:
             axes[0].text(0.97 * limit, place, f"{row['energy']:.1f} →", ha="right", va="center", color="w")
     axes[0].invert_yaxis()
-    axes[0].legend(frameon=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", frameon=False)
     return _run.save_figure(figure, out / "generators.png")
 
 

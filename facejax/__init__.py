@@ -10,8 +10,9 @@ nothing.
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+# Not from `typing`, whose import takes longer than the rest; type checkers know the name.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from facejax import (
         augment,
@@ -55,7 +56,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name == "load":
         return importlib.import_module("facejax.models.bundle").load
     if name == "pipeline":

@@ -10,7 +10,8 @@ The paper follows the geodesic at constant speed, so that its transitions start 
 also be that of the second recorded motion, which has an onset.
 
 `split_at_peak`, `transition` and `transitions` are array functions. `prototypes`, `select`, `balanced_pairs` and
-`sample_per_pair` choose data once, on the host, in NumPy: the number of rows that they return depends on the labels.
+`sample_per_pair` choose data once, on the host, in NumPy: the number of rows that they return depends on the labels. In
+signatures `_` is a size that the function compares itself, for a message of its own.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Float64, Int32, Integer, Real
 
 from facejax.geometry import align, sphere, srvf
+from facejax.geometry.sphere import AnyArray
 
 TIME_WARPS = ("even", "performed")
 
@@ -30,20 +34,20 @@ TIME_WARPS = ("even", "performed")
 class Motions(NamedTuple):
     """K motions, encoded by `facejax.geometry.srvf.encode`, with their first frames."""
 
-    q: jax.Array  # (K, T-1, L, 3), on the unit sphere
-    log_length: jax.Array  # (K,)
-    start: jax.Array  # (K, L, 3)
+    q: Float[AnyArray, "K S L 3"]  # on the unit sphere; S = T-1
+    log_length: Float[AnyArray, " K"]
+    start: Float[AnyArray, "K L 3"]
 
 
 class Selection(NamedTuple):
     """P pairs of motions: transition k goes from the peak of pairs[k, 0] to the peak of pairs[k, 1]."""
 
-    pairs: np.ndarray  # (P, 2) int32, ordered by class of start, class of end, distance
-    distance: np.ndarray  # (P,) float64, of (start, end) to the two prototypes, in the unit of the landmarks
+    pairs: Int32[np.ndarray, "P 2"]  # ordered by class of start, class of end, distance
+    distance: Float64[np.ndarray, " P"]  # of (start, end) to the two prototypes, in the unit of the landmarks
 
 
 @jax.jit
-def apex(curve: jax.Array) -> jax.Array:
+def apex(curve: Float[AnyArray, "... L 3"]) -> Integer[Array, " ..."]:
     """Return the frame (...) of a curve (..., T, L, 3) farthest from its first one, over all landmarks."""
     _check_curve(curve)
     away = jnp.sum((curve - curve[..., :1, :, :]) ** 2, axis=(-2, -1))
@@ -51,7 +55,9 @@ def apex(curve: jax.Array) -> jax.Array:
 
 
 @jax.jit(static_argnames=("frames",))
-def split_at_peak(curve: jax.Array, peak: jax.Array | int, *, frames: int = 30) -> tuple[jax.Array, jax.Array]:
+def split_at_peak(
+    curve: Float[AnyArray, "*#lead T L 3"], peak: Integer[ArrayLike, "*#lead"], *, frames: int = 30
+) -> tuple[Float[Array, "*lead {frames} L 3"], Float[Array, "*lead {frames} L 3"]]:
     """Cut a curve (..., T, L, 3) at the frame `peak` (...) into onset and offset, each (..., frames, L, 3).
 
     Both contain the peak; time is resampled evenly within each half. Raises `ValueError` for fewer than 2 frames.
@@ -67,16 +73,16 @@ def split_at_peak(curve: jax.Array, peak: jax.Array | int, *, frames: int = 30) 
 
 @jax.jit(static_argnames=("frames",))
 def transition(
-    q1: jax.Array,
-    log_length1: jax.Array,
-    q2: jax.Array,
-    log_length2: jax.Array,
-    start1: jax.Array,
-    start2: jax.Array,
-    tau: jax.Array | None = None,
+    q1: Float[AnyArray, "*#lead S L 3"],
+    log_length1: Real[ArrayLike, "*#lead"],
+    q2: Float[AnyArray, "*#lead S L 3"],
+    log_length2: Real[ArrayLike, "*#lead"],
+    start1: Float[AnyArray, "*#lead _ 3"],
+    start2: Float[AnyArray, "*#lead _ 3"],
+    tau: Float[AnyArray, "*#lead _"] | None = None,
     *,
     frames: int = 30,
-) -> jax.Array:
+) -> Float[Array, "*lead {frames} L 3"]:
     """Return landmarks (..., frames, L, 3) from the last frame of motion 1 to the last frame of motion 2.
 
     q1, q2 are (..., T-1, L, 3) on the unit sphere, log lengths (...), starts (..., L, 3). A frame is the last frame
@@ -100,11 +106,12 @@ def transition(
         raise ValueError(f"tau: expected (..., {frames}), one fraction per frame, got shape {tau.shape}")
     angle = theta[..., None] * tau
     a, b = jnp.cos(angle)[..., None], (tau * jnp.sinc(angle / jnp.pi))[..., None]
-    flat = [x.reshape(*x.shape[:-2], 3 * x.shape[-2]) for x in (q1, w)]  # a CPU is slow at rows of three
+    flat = [jnp.reshape(x, (*x.shape[:-2], 3 * x.shape[-2])) for x in (q1, w)]  # a CPU is slow at rows of three
     pp, pw, ww = (jnp.sum(x * y, axis=-1)[..., None, :] for x, y in ((flat[0],) * 2, flat, (flat[1],) * 2))
     # Rounding may leave the square of a step that cancels just below 0; the root takes it as 0.
     pace = sphere.safe_sqrt(a**2 * pp + 2 * a * b * pw + b**2 * ww)
     moves = sum(jnp.einsum("...ft,...td->...fd", part * pace, x) for part, x in zip((a, b), flat, strict=True))
+    moves = jnp.asarray(moves)
     moves = moves.reshape(*moves.shape[:-1], *q1.shape[-2:])
     log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])
     start = _between(tau[..., None, None], start1[..., None, :, :], start2[..., None, :, :])
@@ -113,7 +120,7 @@ def transition(
 
 def transitions(
     motions: Motions, pairs: np.ndarray, *, frames: int = 30, time_warp: str = "even", chunk: int = 128
-) -> Iterator[jax.Array]:
+) -> Iterator[Float[Array, "n {frames} L 3"]]:
     """Yield the transitions (n, frames, L, 3) of the index pairs (P, 2), n <= chunk at a time, in order.
 
     `time_warp`: "even" in time, or "performed": the fraction of the geodesic at a frame is the fraction of its arc
@@ -134,7 +141,9 @@ def transitions(
     return _stream(motions, pairs, frames, time_warp, min(chunk, max(len(pairs), 1)))
 
 
-def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.ndarray:
+def prototypes(
+    peaks: Real[AnyArray, "... L 3"], labels: Integer[AnyArray, " _"], *, classes: int
+) -> Float64[np.ndarray, "{classes} L 3"]:
     """Return the mean peak (classes, L, 3) of each class, from peaks (K, L, 3) and labels (K,) in [0, classes).
 
     Raises `ValueError` where a class has no peak, and for labels out of range.
@@ -151,7 +160,12 @@ def prototypes(peaks: np.ndarray, labels: np.ndarray, *, classes: int) -> np.nda
 
 
 def select(
-    peaks: np.ndarray, labels: np.ndarray, prototypes: np.ndarray, *, per_pair: int, reuse: int | None = None
+    peaks: Real[AnyArray, "... L 3"],
+    labels: Integer[AnyArray, " _"],
+    prototypes: Real[AnyArray, "C _ 3"],
+    *,
+    per_pair: int,
+    reuse: int | None = None,
 ) -> Selection:
     """Select for each ordered pair of different classes the `per_pair` transitions nearest to the two prototypes.
 
@@ -181,7 +195,9 @@ def select(
     return Selection(np.concatenate(pairs), np.concatenate(distances))
 
 
-def balanced_pairs(labels: np.ndarray, *, classes: int, per_pair: int | None = None, seed: int = 0) -> np.ndarray:
+def balanced_pairs(
+    labels: Integer[AnyArray, " K"], *, classes: int, per_pair: int | None = None, seed: int = 0
+) -> Int32[np.ndarray, "P 2"]:
     """Draw index pairs (P, 2) int32 of motions with labels (K,), for each ordered pair of different classes.
 
     `per_pair` distinct pairs of each (None, or more than exist: all), in which every start and every end occurs
@@ -203,7 +219,9 @@ def balanced_pairs(labels: np.ndarray, *, classes: int, per_pair: int | None = N
     return np.concatenate(pairs)
 
 
-def sample_per_pair(start: np.ndarray, end: np.ndarray, *, seed: int = 0) -> np.ndarray:
+def sample_per_pair(
+    start: Integer[AnyArray, " K"], end: Integer[AnyArray, " _"], *, seed: int = 0
+) -> Bool[np.ndarray, " K"]:
     """Return a mask (K,) that selects one random motion of each (start, end) that occurs: OT23's test set."""
     start, end = np.asarray(start), np.asarray(end)
     if start.shape != end.shape or start.ndim != 1:
@@ -236,8 +254,8 @@ def _candidates(starts: int, ends: int, count: int, reuse: int | None) -> tuple[
     return first[inside], second[inside]
 
 
-def _between(tau: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
-    return a + tau * (b - a)
+def _between(tau: jax.Array, a: AnyArray, b: AnyArray) -> jax.Array:
+    return jnp.asarray(a) + tau * (b - a)
 
 
 @jax.jit(static_argnames=("frames", "pace"))
@@ -259,12 +277,12 @@ def _stream(motions: Motions, pairs: np.ndarray, frames: int, pace: str, chunk: 
         yield _chunk(motions, jnp.asarray(padded, jnp.int32), frames=frames, pace=pace)[: len(rows)]
 
 
-def _check_curve(curve: jax.Array) -> None:
+def _check_curve(curve: AnyArray) -> None:
     if jnp.ndim(curve) < 3 or curve.shape[-1] != 3 or curve.shape[-3] < 2:
         raise ValueError(f"expected a curve (..., T, L, 3) with T >= 2, got shape {jnp.shape(curve)}")
 
 
-def _labelled(peaks: np.ndarray, labels: np.ndarray, classes: int) -> tuple[np.ndarray, np.ndarray]:
+def _labelled(peaks: AnyArray, labels: AnyArray, classes: int) -> tuple[np.ndarray, np.ndarray]:
     peaks, labels = np.asarray(peaks, np.float64), np.asarray(labels)
     if peaks.ndim != 3 or peaks.shape[-1] != 3:
         raise ValueError(f"peaks: expected (K, L, 3), got {peaks.shape}")

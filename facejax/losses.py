@@ -5,8 +5,11 @@ critic (here: the two labels). `score(sample, condition)` is the critic of ONE s
 Mesh losses take displacements in millimetres with leading axes free; they sum over x, y, z and take the mean
 over the vertices and the leading axes, so that values are "millimetres (L1) per vertex".
 
-Functions that take arrays are jitted; those that take a `score` are left to the caller's jit.
+Functions that take arrays are jitted; those that take a `score` are left to the caller's jit. In signatures `_` is a
+size that the function compares itself, for a message of its own.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
@@ -14,16 +17,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Integer, Key, Real
 
 from facejax.geometry import sphere
-from facejax.geometry.sphere import safe_sqrt
+from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 Sample = Any
 Condition = Any
 Score = Callable[[Sample, Condition], jax.Array]
 
 
-def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, condition: Condition) -> jax.Array:
+def gradient_penalty(
+    score: Score, key: Key[Array, ""], real: Sample, fake: Sample, condition: Condition
+) -> Float[Array, ""]:
     """Return the mean of (|grad score(x)| - 1)^2 with x uniform on the chords between real and fake samples.
 
     `real`, `fake`: pytrees whose leaves are (B, ...); one position in [0, 1) per sample, shared by all
@@ -36,7 +43,7 @@ def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, c
     def squared_slope(tau: jax.Array, real: Sample, fake: Sample, condition: Condition) -> jax.Array:
         between = jax.tree.map(lambda r, f: (1.0 - tau) * r + tau * f, real, fake)
         slope = jax.grad(score)(between, condition)
-        return sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(slope))
+        return jnp.asarray(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(slope)))
 
     squared = jax.vmap(squared_slope)(tau, real, fake, condition)
     flat = squared == 0.0  # the branch is chosen before the root, so that its derivative never sees 1 / 0
@@ -46,13 +53,13 @@ def gradient_penalty(score: Score, key: jax.Array, real: Sample, fake: Sample, c
 
 def critic(
     score: Score,
-    key: jax.Array,
+    key: Key[Array, ""],
     real: Sample,
     fake: Sample,
     condition: Condition,
     *,
     penalty: float = 10.0,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the critic's loss, E[score(fake)] - E[score(real)] + penalty * gradient penalty.
 
     Samples and conditions have a leading axis B. Returns the loss and its terms: `wasserstein` (the estimated
@@ -65,13 +72,13 @@ def critic(
     return penalty * slope - distance, {"wasserstein": distance, "slope": slope}
 
 
-def generator(score: Score, fake: Sample, condition: Condition) -> jax.Array:
+def generator(score: Score, fake: Sample, condition: Condition) -> Float[Array, ""]:
     """Return the generator's adversarial loss, -E[score(fake)]; samples and conditions have a leading axis B."""
     return -jnp.mean(jax.vmap(score)(fake, condition))
 
 
 @jax.jit
-def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
+def tangent_l1(predicted: Float[AnyArray, "*shape"], target: Float[AnyArray, "*shape"]) -> Float[Array, ""]:
     """Return the mean absolute difference of two arrays of tangent vectors (..., T-1, L, 3), or of any equal shapes.
 
     Otberdout et al. 2023, eq 6; the mean over entries, not the sum.
@@ -81,8 +88,13 @@ def tangent_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
 
 
 def flow_matching(
-    field: Callable[..., Any], key: jax.Array, source: Sample, target: Sample, condition: Condition, scale: jax.Array
-) -> jax.Array:
+    field: Callable[..., Any],
+    key: Key[Array, ""],
+    source: Sample,
+    target: Sample,
+    condition: Condition,
+    scale: Float[AnyArray, "B C"],
+) -> Float[Array, ""]:
     """Return the mean squared error of a velocity field against geodesics between samples of source and target.
 
     Samples are (y, s): y (B, 1, 1, C) on a unit sphere, s (B, S). `field(state, time, condition) -> (v, rate)` takes
@@ -103,7 +115,7 @@ def flow_matching(
 
 
 @jax.jit
-def displacement_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
+def displacement_l1(predicted: Float[AnyArray, "*lead N 3"], target: Float[AnyArray, "*lead _ 3"]) -> Float[Array, ""]:
     """Return the L1 error of displacements (..., N, 3) in mm: sum over xyz, mean over vertices and leading axes.
 
     Otberdout et al. 2023, eq 8.
@@ -113,7 +125,9 @@ def displacement_l1(predicted: jax.Array, target: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def weighted_l1(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> jax.Array:
+def weighted_l1(
+    predicted: Float[AnyArray, "*lead N 3"], target: Float[AnyArray, "*lead _ 3"], weights: Float[AnyArray, " _"]
+) -> Float[Array, ""]:
     """Return `displacement_l1` with every vertex's error times its weight (N,); the mean still divides by N.
 
     Otberdout et al. 2023, eq 9. Takes meshes or displacements: the neutral face cancels in the difference.
@@ -126,14 +140,14 @@ def weighted_l1(predicted: jax.Array, target: jax.Array, weights: jax.Array) -> 
 
 @partial(jax.jit, static_argnames="reduction")
 def s2d(
-    predicted: jax.Array,
-    target: jax.Array,
-    weights: jax.Array,
+    predicted: Float[AnyArray, "*lead N 3"],
+    target: Float[AnyArray, "*lead _ 3"],
+    weights: Float[AnyArray, " _"],
     *,
-    beta1: float = 1.0,
-    beta2: float = 0.1,
+    beta1: Real[ArrayLike, ""] = 1.0,
+    beta2: Real[ArrayLike, ""] = 0.1,
     reduction: str = "paper",
-) -> jax.Array:
+) -> Float[Array, ""]:
     """Return the mesh decoder's loss on displacements (..., N, 3) in mm, with vertex weights (N,).
 
     `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure
@@ -152,12 +166,12 @@ def s2d(
 
 @partial(jax.jit, static_argnames="mode")
 def landmark_weights(
-    vertices: jax.Array,
-    landmark_indices: jax.Array,
+    vertices: Float[AnyArray, "N _"],
+    landmark_indices: Integer[AnyArray, " L"],
     *,
     mode: str = "linear",
-    edge_length: float | None = None,
-) -> jax.Array:
+    edge_length: Real[ArrayLike, ""] | None = None,
+) -> Float[Array, " N"]:
     """Return vertex weights (N,) in [0, 1]: 1 at the landmarks, falling with the distance d to the nearest one.
 
     `vertices` (N, 3), `landmark_indices` (L,) of vertices. `linear`: 1 - d / d_max, which the authors'
@@ -179,11 +193,13 @@ def landmark_weights(
         return jnp.maximum(1.0 - distance / jnp.where(farthest > 0, farthest, 1.0), 0.0)
     if edge_length is None:
         raise ValueError("edge_length: mode 'inverse' needs the mean edge length of the mesh, got None")
-    return edge_length / jnp.maximum(distance, edge_length)
+    return jnp.asarray(edge_length) / jnp.maximum(distance, edge_length)
 
 
 @jax.jit
-def next_step(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+def next_step(
+    predicted: Float[AnyArray, "*lead T L 3"], target: Float[AnyArray, "*lead T L 3"], mask: Bool[AnyArray, "*lead _"]
+) -> Float[Array, ""]:
     """Return the mean squared error of steps (..., T, L, 3) over the frames where the mask (..., T) is set.
 
     Seo and Luo 2021, L_disp: a sum in the formula, a mean in the text; here the mean. An empty mask gives 0.
@@ -194,7 +210,9 @@ def next_step(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.A
 
 
 @jax.jit
-def path_distance(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> jax.Array:
+def path_distance(
+    predicted: Float[AnyArray, "*lead T L 3"], target: Float[AnyArray, "*lead T L 3"], mask: Bool[AnyArray, "*lead _"]
+) -> Float[Array, ""]:
     """Return the mean distance of the positions that steps (..., T, L, 3) add up to, where the mask (..., T) is set.
 
     Errors of single steps accumulate; this measures the positions. It is a distance, not its square: the optimal
@@ -206,7 +224,7 @@ def path_distance(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> j
 
 
 @jax.jit
-def step_energy(steps: jax.Array, mask: jax.Array) -> jax.Array:
+def step_energy(steps: Float[AnyArray, "*lead T L 3"], mask: Bool[AnyArray, "*lead _"]) -> Float[Array, " 2"]:
     """Return the mean squares (2,) of steps (..., T, L, 3) and of their differences in time, where the mask is set."""
     _same_steps(steps, steps, mask)
     parts = ((steps, mask), (jnp.diff(steps, axis=-3), mask[..., 1:] & mask[..., :-1]))
@@ -214,7 +232,9 @@ def step_energy(steps: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def energy_ratio(predicted: jax.Array, mask: jax.Array, reference: jax.Array) -> jax.Array:
+def energy_ratio(
+    predicted: Float[AnyArray, "*lead T L 3"], mask: Bool[AnyArray, "*lead _"], reference: Float[AnyArray, " 2"]
+) -> Float[Array, ""]:
     """Return the penalty (r - 1)^2 on the ratio r of the motion's root mean square to that of the training set.
 
     Summed over two ratios, of steps (..., T, L, 3) and of their differences, both over all sequences where the mask
@@ -225,16 +245,16 @@ def energy_ratio(predicted: jax.Array, mask: jax.Array, reference: jax.Array) ->
     return jnp.where(jnp.any(mask), jnp.sum(jnp.square(ratio - 1)), 0)
 
 
-def _masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
+def _masked_mean(values: AnyArray, mask: AnyArray) -> jax.Array:
     return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(jnp.sum(mask), 1)
 
 
-def _same_steps(predicted: jax.Array, target: jax.Array, mask: jax.Array) -> None:
+def _same_steps(predicted: AnyArray, target: AnyArray, mask: AnyArray) -> None:
     _same_shape(predicted, target)
     if predicted.ndim < 3 or mask.shape != predicted.shape[:-2]:
         raise ValueError(f"mask: expected shape {predicted.shape[:-2]}, one per frame of steps, got {mask.shape}")
 
 
-def _same_shape(predicted: jax.Array, target: jax.Array) -> None:
+def _same_shape(predicted: AnyArray, target: AnyArray) -> None:
     if predicted.shape != target.shape:
         raise ValueError(f"predicted, target: expected equal shapes, got {predicted.shape} and {target.shape}")

@@ -3,7 +3,7 @@
 Meshes are (..., N, 3), motions (..., T, L, 3). The distance of two motions is the Euclidean distance per
 landmark, averaged over landmarks and frames. Specificity, diversity and their real-data ceilings follow
 Otberdout et al. 2023, section 4.3, and Davies et al. 2002; compare them at equal counts and for the same label
-pairs.
+pairs. In signatures `_` is a size that the function compares itself, for a message of its own.
 """
 
 from __future__ import annotations
@@ -14,27 +14,35 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Real
 
 from facejax.geometry import sphere
+from facejax.geometry.sphere import AnyArray
 
 
 class Error(NamedTuple):
     """Mean and standard deviation of the vertex distance, over `count` vertices x frames."""
 
-    mean: jax.Array
-    std: jax.Array
-    count: jax.Array
+    mean: jax.Array | np.float64
+    std: jax.Array | np.float64
+    count: jax.Array | np.float64  # pyright: ignore[reportIncompatibleMethodOverride]  a field, not tuple's method
 
 
 @jax.jit
-def vertex_distance(predicted: jax.Array, target: jax.Array) -> jax.Array:
+def vertex_distance(
+    predicted: Float[AnyArray, "*lead N 3"], target: Float[AnyArray, "*lead _ 3"]
+) -> Float[Array, "*lead N"]:
     """Return the Euclidean distance (..., N) of each vertex of predicted to target (..., N, 3)."""
     _check_same(predicted, target, 2)
     return _norm(predicted - target)
 
 
 @jax.jit
-def vertex_error(predicted: jax.Array, target: jax.Array, mask: jax.Array | None = None) -> Error:
+def vertex_error(
+    predicted: Float[AnyArray, "*lead N 3"],
+    target: Float[AnyArray, "*lead _ 3"],
+    mask: Bool[AnyArray, " _"] | Real[AnyArray, " _"] | None = None,
+) -> Error:
     """Return mean and population standard deviation of `vertex_distance` over vertices, frames and leading axes.
 
     mask (N,), bool or weights, selects vertices (a face region, for example). An empty mask gives NaN. Use `pool` for
@@ -62,14 +70,14 @@ def pool(errors: Sequence[Error]) -> Error:
 
 
 @jax.jit
-def speed(landmarks: jax.Array) -> jax.Array:
+def speed(landmarks: Float[AnyArray, "... L 3"]) -> Float[Array, " ..."]:
     """Return the mean norm (...) of the first differences in time of landmarks (..., T, L, 3), per frame."""
     _check_motion(landmarks, 2)
     return jnp.mean(_norm(jnp.diff(landmarks, axis=-3)), axis=(-2, -1))
 
 
 @jax.jit
-def acceleration(landmarks: jax.Array) -> jax.Array:
+def acceleration(landmarks: Float[AnyArray, "... L 3"]) -> Float[Array, " ..."]:
     """Return the mean norm (...) of the second differences in time of landmarks (..., T, L, 3), per frame squared.
 
     It measures jitter: noise of standard deviation s in every coordinate adds about 3.9 s (the mean norm of 3
@@ -80,7 +88,9 @@ def acceleration(landmarks: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def peak_displacement(landmarks: jax.Array, neutral: jax.Array) -> jax.Array:
+def peak_displacement(
+    landmarks: Float[AnyArray, "*#lead T L 3"], neutral: Float[AnyArray, "*#lead _ 3"]
+) -> Float[Array, "*lead"]:
     """Return the mean displacement (...) of landmarks (..., T, L, 3) from neutral (..., L, 3), largest over frames."""
     _check_motion(landmarks, 1)
     if jnp.shape(neutral)[-2:] != landmarks.shape[-2:]:
@@ -89,7 +99,9 @@ def peak_displacement(landmarks: jax.Array, neutral: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
+def specificity(
+    samples: Float[AnyArray, "*#lead K T L 3"], reference: Float[AnyArray, "*#lead _ L 3"]
+) -> Float[Array, "*lead"]:
     """Return the mean distance (...) of samples (..., K, T, L, 3) to the one reference (..., T, L, 3)."""
     _check_motion(samples, 1, axes=4)
     if jnp.shape(reference)[-3:] != samples.shape[-3:]:
@@ -98,7 +110,7 @@ def specificity(samples: jax.Array, reference: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def distances(a: jax.Array, b: jax.Array) -> jax.Array:
+def distances(a: Float[AnyArray, "... T L 3"], b: Float[AnyArray, "... _ L 3"]) -> Float[Array, "K M"]:
     """Return the distance (K, M) of each motion of a (K, T, L, 3) to each of b (M, T, L, 3)."""
     _check_motion(a, 1, axes=4)
     _check_motion(b, 1, axes=4)
@@ -108,7 +120,7 @@ def distances(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def mean_off_diagonal(own: jax.Array) -> jax.Array:
+def mean_off_diagonal(own: Float[AnyArray, "K _"]) -> Float[Array, ""]:
     """Return the mean () of a square table (K, K), K >= 2, without its diagonal."""
     if own.ndim != 2 or own.shape[0] != own.shape[1] or len(own) < 2:
         raise ValueError(f"expected (K, K) with K >= 2, got {own.shape}")
@@ -116,7 +128,7 @@ def mean_off_diagonal(own: jax.Array) -> jax.Array:
 
 
 @jax.jit(static_argnames=("neighbours",))
-def coverage(across: jax.Array, real: jax.Array, *, neighbours: int = 5) -> jax.Array:
+def coverage(across: Float[AnyArray, "K _"], real: Float[AnyArray, "M M"], *, neighbours: int = 5) -> Float[Array, ""]:
     """Return the fraction () of real motions near a generated one, from tables (K, M) and (M, M) of `distances`.
 
     Near: within the distance of the real motion's k-th real neighbour, k = `neighbours`. Naeem et al. 2020.
@@ -128,7 +140,9 @@ def coverage(across: jax.Array, real: jax.Array, *, neighbours: int = 5) -> jax.
 
 
 @jax.jit
-def energy_distance(across: jax.Array, drawn: jax.Array, real: jax.Array) -> jax.Array:
+def energy_distance(
+    across: Float[AnyArray, "K M"], drawn: Float[AnyArray, "K K"], real: Float[AnyArray, "M M"]
+) -> Float[Array, ""]:
     """Return the energy distance () of two sets of motions, from tables (K, M), (K, K) and (M, M) of `distances`.
 
     (2 E|X - Y| - E|X - X'| - E|Y - Y'|) / E|Y - Y'|; 0 for equal distributions. Szekely & Rizzo 2013. Unbiased: two
@@ -139,7 +153,7 @@ def energy_distance(across: jax.Array, drawn: jax.Array, real: jax.Array) -> jax
 
 
 @jax.jit
-def diversity(samples: jax.Array) -> jax.Array:
+def diversity(samples: Float[AnyArray, "... T L 3"]) -> Float[Array, " ..."]:
     """Return the mean distance (...) over all pairs of the samples (..., K, T, L, 3), K >= 2."""
     _check_motion(samples, 1, axes=4)
     count = samples.shape[-4]
@@ -155,7 +169,9 @@ def diversity(samples: jax.Array) -> jax.Array:
 
 
 @jax.jit(static_argnames=("chunk",))
-def nearest_distance(samples: jax.Array, training: jax.Array, *, chunk: int = 64) -> jax.Array:
+def nearest_distance(
+    samples: Float[AnyArray, "K T L 3"], training: Float[AnyArray, "M _ L 3"], *, chunk: int = 64
+) -> Float[Array, " K"]:
     """Return the distance (K,) of each sample (K, T, L, 3) to the nearest of the training set (M, T, L, 3).
 
     Its mean is the specificity of Davies et al. 2002. Differences are formed for `chunk` training motions at
@@ -174,21 +190,21 @@ def nearest_distance(samples: jax.Array, training: jax.Array, *, chunk: int = 64
     return jax.lax.map(to_nearest, samples)
 
 
-def _motion_distance(a: jax.Array, b: jax.Array) -> jax.Array:
+def _motion_distance(a: AnyArray, b: AnyArray) -> jax.Array:
     return jnp.mean(_norm(a - b), axis=(-2, -1))
 
 
-def _norm(vectors: jax.Array) -> jax.Array:
+def _norm(vectors: AnyArray) -> jax.Array:
     """Return the norm over the last axis, with gradient 0 at 0."""
     return sphere.safe_sqrt(jnp.sum(vectors**2, axis=-1))
 
 
-def _check_same(a: jax.Array, b: jax.Array, axes: int) -> None:
+def _check_same(a: AnyArray, b: AnyArray, axes: int) -> None:
     if jnp.shape(a) != jnp.shape(b) or jnp.ndim(a) < axes or jnp.shape(a)[-1] != 3:
         raise ValueError(f"expected two arrays (..., N, 3) of one shape, got {jnp.shape(a)} and {jnp.shape(b)}")
 
 
-def _check_motion(motion: jax.Array, least: int, axes: int = 3) -> None:
+def _check_motion(motion: AnyArray, least: int, axes: int = 3) -> None:
     shape = jnp.shape(motion)
     if len(shape) < axes or shape[-1] != 3 or shape[-3] < least:
         form = "(..., T, L, 3)" if axes == 3 else "(..., K, T, L, 3)"

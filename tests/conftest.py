@@ -12,8 +12,11 @@ import pytest
 import trimesh
 
 # Modules whose shape annotations are checked when tests run; before anything of facejax is imported.
-TYPED = ["facejax.geometry.host", "facejax.mesh.normals"]
-jaxtyping.install_import_hook(TYPED, "beartype.beartype")
+# An int is a float too, as for a static type checker: `alpha=1`.
+TYPED = ["augment", "geometry", "landmarks", "losses", "mesh", "metrics", "models"]
+jaxtyping.install_import_hook(
+    [f"facejax.{name}" for name in TYPED], "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+)
 
 from facejax.data.synthetic import makehuman, makehuman4d  # noqa: E402
 from tests import balls  # noqa: E402

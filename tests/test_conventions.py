@@ -140,7 +140,7 @@ BELOW = {
     "assets": set(),
     "io.atomic": set(),
     "geometry": set(),
-    "mesh": {"geometry"},
+    "mesh": {"geometry", "io.atomic"},
     "landmarks": {"geometry"},
     "losses": {"geometry"},
     "metrics": {"geometry"},

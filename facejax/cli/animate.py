@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def animate(
     intensity: float = 1.0,
     fps: float | None = None,
     formats: Sequence[str] = ("glb", "html", "webp"),
-    **options,
+    **options: Any,
 ) -> tuple[list[Path], tuple[str, ...]]:
     """Retarget a motion to a mesh with its landmarks, to a MakeHuman person, or to the average face.
 

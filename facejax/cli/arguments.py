@@ -23,7 +23,7 @@ class Generate:
     start: str = "neutral"
     """Initial expression."""
     then: UseAppendAction[tuple[str, ...]] = ()
-    """A further expression; repeat the flag: `--then A --then B`."""
+    """A further expression, to chain several; repeat the flag: `--then A --then B`."""
     face: Path | None = None
     """Neutral face (PLY, OBJ, GLB or NPZ): the model's 3,260 vertices, or MakeHuman's body. Default: the average face.
     With --landmarks: a scan of a head in any topology."""
@@ -36,7 +36,8 @@ class Generate:
     samples: int = 1
     """Number of motions."""
     frames: int | Literal["natural"] = 30
-    """Frames of each transition; "natural": durations generated with the motion, as people perform it."""
+    """Frames of each transition; "natural": generated with the motion, as in the training data, where an onset is a
+    random draw of 18 to 39 frames at 60 frames per second."""
     fps: float = 30.0
     """Frames per second of the output."""
     intensity: float = 1.0
@@ -44,9 +45,9 @@ class Generate:
     formats: tuple[Format, ...] = ("glb", "html", "webp")
     """Output formats; landmarks are always written as NPZ. "ply" and "obj" write a folder of frames."""
     count: int | None = None
-    """Write a corpus of so many motions instead, as NPZ files with an index. Run again to resume an interrupted one."""
+    """Write a corpus of N motions instead, as NPZ files with an index. Run again to resume an interrupted one."""
     people: int = 0
-    """With --count: draw each motion's face from so many MakeHuman people. Default: one face for all motions."""
+    """With --count: draw each motion's face from N MakeHuman people. Default: one face for all motions."""
     meshes: bool = False
     """With --count: write vertices as well as landmarks."""
     shard: int | None = None
@@ -85,8 +86,8 @@ class Animate:
     person: int | None = None
     """Without --mesh: index of a MakeHuman person (100 to 119 are test subjects). Default: the average face."""
     frames: int | Literal["natural"] | None = None
-    """Frames of each transition (default 30; "natural": durations generated with the motion), or the maximal length of
-    an expression."""
+    """Frames of each transition (default 30; "natural": generated with the motion, as in the training data, where an
+    onset is a random draw of 18 to 39 frames at 60 frames per second), or the maximal length of an expression."""
     whole: bool = False
     """With --expression: play all frames, also those after the expression has ended."""
     seed: int = 7

@@ -77,7 +77,7 @@ def check_fps(fps: float) -> None:
 
 
 def check_total_frames(samples: int, frames: Iterable[int]) -> None:
-    """Raise `ValueError` where `samples` motions of transitions of so many `frames` are more than one call writes."""
+    """Raise `ValueError` where `samples` motions, whose transitions have `frames` each, exceed `MAX_FRAMES` in all."""
     if (total := samples * sum(frames)) > MAX_FRAMES:
         raise ValueError(f"{samples} samples have {total} frames, expected up to {MAX_FRAMES}: take fewer, or --count")
 

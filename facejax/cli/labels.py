@@ -13,7 +13,7 @@ MODELS = "makehuman4d.safetensors"  # `models.bundle.RELEASED`, which cannot be 
 EXPRESSIONS = "expressions.safetensors"  # `inference.expressions.RELEASED`
 
 
-def read_labels(path: str | os.PathLike | None = None, *, released: str = MODELS) -> tuple[str, ...]:
+def read_labels(path: str | os.PathLike[str] | None = None, *, released: str = MODELS) -> tuple[str, ...]:
     """Return the labels of a model file, by default of a released one.
 
     Raises:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from rich.console import Console
@@ -72,20 +73,26 @@ def scene_of(
 
 def save(out: Path, stem: str, suffix: str, scene: Scene, fps: float) -> Path:
     """Write a scene as `out/stem.suffix` ("ply" and "obj": a folder of frames); return the path."""
-    path, options = out / f"{stem}.{suffix}", {"captions": scene.captions, "extras": scene.extras}
+    path = out / f"{stem}.{suffix}"
     if suffix in ("ply", "obj"):
         path = out / f"{stem}-{suffix}"
         io.meshes.write_sequence(path, scene.vertices, scene.faces, format=suffix)
         return path
     if f".{suffix}" in video.FORMATS:
         every = max(1, round(fps / VIDEO_FPS))
-        scene, fps = _subsample(scene, every), fps / every
-        options = {"captions": scene.captions, "extras": scene.extras, "size": (256, 320)}
-    elif suffix == "html":
-        options["landmarks"] = scene.landmarks
+        few = _subsample(scene, every)
+        io.save(
+            path, few.vertices, few.faces, fps=fps / every, title=stem,
+            captions=few.captions, extras=few.extras, size=(256, 320),
+        )  # fmt: skip
     elif suffix == "npz":
-        options = {"landmarks": scene.landmarks}
-    io.save(path, scene.vertices, scene.faces, fps=fps, title=stem, **options)
+        io.save(path, scene.vertices, scene.faces, fps=fps, title=stem, landmarks=scene.landmarks)
+    else:
+        marks = scene.landmarks if suffix == "html" else None
+        io.save(
+            path, scene.vertices, scene.faces, fps=fps, title=stem,
+            captions=scene.captions, extras=scene.extras, landmarks=marks,
+        )  # fmt: skip
     return path
 
 
@@ -126,8 +133,14 @@ def _subsample(scene: Scene, every: int) -> Scene:
     return scene._replace(vertices=scene.vertices[chosen], captions=captions, extras=tuple(parts))
 
 
+class Advance(Protocol):
+    """The function that `progress` yields: without arguments it adds one step, with them it sets both numbers."""
+
+    def __call__(self, done: int | None = None, total: int | None = None) -> None: ...
+
+
 @contextmanager
-def progress(name: str, total: int | None) -> Iterator:
+def progress(name: str, total: int | None) -> Generator[Advance]:
     """Show a progress bar where standard error is a terminal.
 
     Yields a function: without arguments it adds one step; `advance(done, total)` sets both numbers.
@@ -137,7 +150,7 @@ def progress(name: str, total: int | None) -> Iterator:
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(name, total=total)
 
-        def advance(done=None, total=None):
+        def advance(done: int | None = None, total: int | None = None) -> None:
             bar.update(task, advance=1) if done is None else bar.update(task, completed=done, total=total)
 
         yield advance

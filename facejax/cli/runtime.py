@@ -86,12 +86,14 @@ def join_distributed(*, patience: int = 20) -> None:
         raise ValueError(
             f"expected all of {', '.join(_JOB_VARIABLES)}, the last two whole numbers, or none; got {values}"
         )
-    job = [values[0], *map(int, values[1:])] if values else []
+    address, count, index = (values[0], int(values[1]), int(values[2])) if values else (None, None, None)
     if values:
         _check_address(values[0])
         print(f"waiting for {values[1]} processes at {values[0]}", file=sys.stderr, flush=True)
     try:
-        jax.distributed.initialize(*job, heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience)
+        jax.distributed.initialize(
+            address, count, index, heartbeat_timeout_seconds=patience, shutdown_timeout_seconds=patience
+        )
     except ValueError as error:
         if values:
             raise

@@ -10,6 +10,7 @@ import numpy as np
 from facejax import io
 from facejax.cli import checks, outputs
 from facejax.cli.arguments import View
+from facejax.io import meshes
 
 
 def run(command: View) -> None:
@@ -30,18 +31,19 @@ def write_page(path: Path, out: Path | None = None, *, fps: float | None = None)
     if path.suffix.lower() == ".html":
         return path
     vertices, triangles, extra = _animation(path)
-    stored = extra.pop("fps", 30.0)
-    rate = stored if fps is None else fps
+    rate = extra.get("fps", 30.0) if fps is None else fps
     checks.check_fps(rate)
     outputs.make_output_folder(page.parent)
-    io.save(page, vertices, triangles, fps=rate, title=path.stem, **extra)
+    io.save(page, vertices, triangles, fps=rate, title=path.stem, landmarks=extra.get("landmarks"))
     return page
 
 
-def _animation(path: Path) -> tuple[np.ndarray, np.ndarray | None, dict]:
+def _animation(path: Path) -> tuple[np.ndarray, np.ndarray, meshes.AnimationExtra]:
     if path.suffix.lower() != ".npz":
         mesh = io.load_mesh(path)
         if mesh.faces is None:
             raise ValueError(f"{path}: has no triangles; expected a mesh with faces")
         return mesh.vertices, mesh.faces, {}
-    return io.meshes.read_animation(path)
+    vertices, triangles, extra = meshes.read_animation(path)
+    assert triangles is not None  # only a bare animation lacks them
+    return vertices, triangles, extra

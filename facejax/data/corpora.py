@@ -105,7 +105,8 @@ def load(path: str | Path) -> Corpus:
         shards = tuple(Shard(**entry) for entry in index["shards"])
         total = 0
         for shard in shards:
-            if not (isinstance(shard.file, str) and _SHARD_NAME.fullmatch(shard.file)):
+            # The index is JSON: fields may have any type.
+            if not (type(shard.file) is str and _SHARD_NAME.fullmatch(shard.file)):
                 raise ValueError(f"invalid shard name {shard.file!r}, expected shards/000000.npz and so on")
             if shard.first != total or not shard.count > 0:
                 raise ValueError(

@@ -149,7 +149,7 @@ def _find_inconsistency(
     rows = 0
     for number, one in enumerate(sequences):
         integers = (one.subject, one.start, one.frames, one.onset, one.apex_start, one.apex_end, one.offset)
-        if not all(type(value) is int for value in integers) or not isinstance(one.label, str):
+        if not all(type(value) is int for value in integers) or type(one.label) is not str:
             return f"sequence {number}: expected integers for subject, start, frames and phases, and a string label"
         if one.start != rows or one.frames < 1 or not 0 <= one.subject < len(people):
             return (

@@ -138,7 +138,7 @@ def interpolated_transitions(
 
 
 def _between(
-    onsets: Motions, motions: augment.Motions, chosen, frames: int, time_warp: str, chunk: int
+    onsets: Motions, motions: augment.Motions, chosen: np.ndarray, frames: int, time_warp: str, chunk: int
 ) -> Iterator[Motions]:
     for low in range(0, len(chosen), chunk):
         pairs = chosen[low : low + chunk]
@@ -188,7 +188,7 @@ def _resample(curve: np.ndarray, frames: int, by: str = "time") -> np.ndarray:
     return curve[low] * (1 - weight) + curve[low + 1] * weight
 
 
-def _stack(rows: list[tuple]) -> Motions:
+def _stack(rows: list[tuple[np.ndarray, int, int, int, float, float]]) -> Motions:
     if not rows:
         raise ValueError("the dataset has no such motions in this split")
     curves, *labels, scale, seconds = zip(*rows, strict=True)

@@ -145,7 +145,9 @@ def default_rank(known: motions.Motions) -> int:
 
 
 @jax.jit
-def _place(chart, curves, log_seconds, start, end):
+def _place(
+    chart: tangent_pca.TangentPCA, curves: jax.Array, log_seconds: jax.Array, start: jax.Array, end: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     q, log_length = srvf.encode(curves)
     values = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, 0, 0))(
         chart, sphere.log(chart.p, q), log_length, log_seconds, start, end

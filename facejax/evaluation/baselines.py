@@ -12,7 +12,7 @@ s2d            S2D-Dec (OT23)
 s2d_residual   GPMM estimate plus residual decoder (spiral convolutions on the face); `gpmm` is the estimate alone
 gpmm_found     GPMM estimate with landmark noise sigma (mm) estimated from the landmarks
 ridge          ridge regression, a baseline that published tables lack
-pca38, pca220  3DMM of so many principal components of displacements: OT23's expression-specific one
+pca38, pca220  3DMM with 38 or 220 principal components of displacements: OT23's expression-specific one
 pca220_mean    OT23's common 3DMM: principal components of whole meshes about their overall mean
 dl3dmm         dictionary-learning 3DMM, 220 atoms
 neural3dmm     spiral autoencoder of the neutral face, with the landmarks beside its code
@@ -79,7 +79,7 @@ def _hierarchy(train: MeshSubset, options: Options) -> mesh_hierarchy.Hierarchy:
     return mesh_hierarchy.build(template, np.asarray(train.data.faces))
 
 
-def _linear(model: linear.Model, **fixed) -> Method:
+def _linear(model: linear.Model, **fixed: Any) -> Method:
     def fit(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
         return LinearFit(*fit_linear.fit_linear(model, train, by=options.by, **fixed))
 
@@ -114,10 +114,10 @@ class _WholeMeshes:
 
 
 def _fit_common_pca(train: MeshSubset, folder: Path, options: Options) -> LinearFit:
-    def prepare(batches, **_):
+    def prepare(batches: MeshSubset, **_: Any) -> linear.Basis:
         return linear.pca.prepare(_WholeMeshes(batches), components=220)
 
-    def solve(basis, *, alpha):
+    def solve(basis: linear.Basis, *, alpha: float) -> linear.LinearMap:
         # The components are applied to displacements from the neutral face, which have no mean here.
         at_rest = basis._replace(
             landmark_mean=np.zeros_like(basis.landmark_mean), vertex_mean=np.zeros_like(basis.vertex_mean)
@@ -127,12 +127,14 @@ def _fit_common_pca(train: MeshSubset, folder: Path, options: Options) -> Linear
     return LinearFit(*fit_linear.fit_linear(linear.model(prepare, solve), train, by=options.by))
 
 
-def _fit_s2d(train: MeshSubset, folder: Path, options: Options):
+def _fit_s2d(train: MeshSubset, folder: Path, options: Options) -> tuple[s2d_dec.S2DDec, mesh_hierarchy.Hierarchy]:
     hierarchy = jax.device_put(_hierarchy(train, options))
     return fit_s2d_dec.fit(train, hierarchy, folder, plan=options.decoder, seed=options.seed), hierarchy
 
 
-def _apply_s2d(fitted, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+def _apply_s2d(
+    fitted: tuple[s2d_dec.S2DDec, mesh_hierarchy.Hierarchy], displacements: np.ndarray, neutral: np.ndarray
+) -> np.ndarray:
     params, hierarchy = fitted
     return neutral + np.asarray(s2d_dec.apply(params, hierarchy, np.asarray(displacements, np.float32)))
 

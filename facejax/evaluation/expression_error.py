@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -47,7 +48,7 @@ def expression_scores(
     truth, scale, count = held_out.curves, held_out.scale, held_out.frames
     neutral = jnp.asarray(held_out.neutral) if start == "neutral" else None
 
-    def error(curves, first=0):
+    def error(curves: np.ndarray | jax.Array, first: int = 0) -> float:
         distance = np.linalg.norm(np.asarray(curves) - truth, axis=-1).mean(axis=-1) * scale[:, None]
         return float(np.mean([row[first:end].mean() for row, end in zip(distance, count, strict=True)]))
 
@@ -55,7 +56,7 @@ def expression_scores(
     known = np.concatenate([np.zeros_like(steps[:, :1]), steps[:, :-1]], axis=1)
     before = truth[:, :-1]
 
-    def after(following):
+    def after(following: np.ndarray | jax.Array) -> np.ndarray:
         return np.concatenate([truth[:, :1], before + np.asarray(following)], axis=1)
 
     current, velocity = truth[:, prefix - 1 : prefix], steps[:, prefix - 2 : prefix - 1]
@@ -63,10 +64,10 @@ def expression_scores(
     free = np.broadcast_to(np.asarray(expression_lstm.generate(params, neutral, frames=frames)), truth.shape)
     continued = expression_lstm.generate(params, neutral, jnp.asarray(truth[:, :prefix]), frames=frames)
 
-    def ratio_to_real(curves, order):
+    def ratio_to_real(curves: np.ndarray, order: int) -> float:
         """Return mean squared steps (order 1) or mean norms of second differences (2), as ratios."""
 
-        def strength(rows):
+        def strength(rows: np.ndarray) -> np.floating:
             # In NumPy: every sequence has its own length, for which a jitted function would compile again.
             changes = (
                 np.linalg.norm(np.diff(row[:end] * mm, n=order, axis=0), axis=-1)

@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from facejax import metrics
 from facejax.geometry import sphere, srvf
@@ -94,8 +95,10 @@ def sphere_norm_error(
 
 
 @jax.jit
-def _sphere_norm_error(generator, starts, keys, start, end):
-    def norm(key):
+def _sphere_norm_error(
+    generator: generators.Generator, starts: start_poses.StartPoses, keys: jax.Array, start: ArrayLike, end: ArrayLike
+) -> jax.Array:
+    def norm(key: jax.Array) -> jax.Array:
         pose_key, key = jax.random.split(key)
         pose = start_poses.sample(starts, pose_key, start)
         return sphere.norm(generators.sample(generator, key, start, end, pose).q)

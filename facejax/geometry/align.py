@@ -10,28 +10,32 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
 
-from facejax.geometry.sphere import safe_sqrt
+from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 
 class Similarity(NamedTuple):
     """x -> scale * rotation @ x + translation."""
 
-    rotation: jax.Array  # (..., 3, 3), orthonormal, determinant +1
-    scale: jax.Array  # (...), positive; 1 in a rigid motion
-    translation: jax.Array  # (..., 3)
+    rotation: Float[Array, "*lead 3 3"]  # orthonormal, determinant +1
+    scale: Float[Array, "*lead"]  # positive; 1 in a rigid motion
+    translation: Float[Array, "*lead 3"]
 
 
 @jax.jit
-def centre(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+def centre(points: Float[AnyArray, "*lead K 3"]) -> tuple[Float[Array, "*lead K 3"], Float[Array, "*lead 3"]]:
     """Return points (..., K, 3) minus their centroid, and the centroid (..., 3)."""
     _check_points(points, "points")
     centroid = jnp.mean(points, axis=-2)
-    return points - centroid[..., None, :], centroid
+    return jnp.asarray(points) - centroid[..., None, :], centroid
 
 
 @jax.jit
-def normalise(landmarks: jax.Array, neutral: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def normalise(
+    landmarks: Float[AnyArray, "*#lead T L 3"], neutral: Float[AnyArray, "*#lead L 3"]
+) -> tuple[Float[Array, "*lead T L 3"], Float[Array, "*#lead"], Float[Array, "*#lead 3"]]:
     """Normalise a curve (..., T, L, 3) by the neutral landmarks (..., L, 3) of its subject.
 
     Subtracts the centroid (..., 3) of the *neutral* landmarks and divides by their centred Frobenius norm, the scale
@@ -50,14 +54,18 @@ def normalise(landmarks: jax.Array, neutral: jax.Array) -> tuple[jax.Array, jax.
 
 
 @jax.jit
-def denormalise(unitless: jax.Array, scale: jax.Array, centroid: jax.Array) -> jax.Array:
+def denormalise(
+    unitless: Float[AnyArray, "*#lead T L 3"], scale: Real[ArrayLike, "*#lead"], centroid: Real[AnyArray, "*#lead 3"]
+) -> Float[Array, "*lead T L 3"]:
     """Invert `normalise`: return the curve of unitless (..., T, L, 3), scale (...) and centroid (..., 3)."""
     _check_curve(unitless, 1)
-    return unitless * jnp.asarray(scale)[..., None, None, None] + jnp.asarray(centroid)[..., None, None, :]
+    return jnp.asarray(unitless) * jnp.asarray(scale)[..., None, None, None] + jnp.asarray(centroid)[..., None, None, :]
 
 
 @jax.jit(static_argnames=("scaling",))
-def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -> Similarity:
+def procrustes(
+    source: Float[AnyArray, "*#lead K 3"], target: Float[AnyArray, "*#lead K 3"], *, scaling: bool = False
+) -> Similarity:
     """Fit the rotation, translation and, with `scaling`, scale that align source (..., K, 3) with target (..., K, 3).
 
     Least squares over the K points, never a reflection (Kabsch 1976; scale after Umeyama 1991). Gradients are exact,
@@ -80,7 +88,7 @@ def procrustes(source: jax.Array, target: jax.Array, *, scaling: bool = False) -
 
 
 @jax.jit
-def apply(similarity: Similarity, points: jax.Array) -> jax.Array:
+def apply(similarity: Similarity, points: Float[AnyArray, "... K 3"]) -> Float[Array, "... K 3"]:
     """Apply a similarity to points (..., K, 3)."""
     _check_points(points, "points")
     turned = jnp.einsum("...ij,...kj->...ki", similarity.rotation, points)
@@ -88,7 +96,9 @@ def apply(similarity: Similarity, points: jax.Array) -> jax.Array:
 
 
 @jax.jit(static_argnames=("frames", "by"))
-def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
+def resample(
+    curve: Float[AnyArray, "*lead T L 3"], *, frames: int, by: str = "time"
+) -> Float[Array, "*lead {frames} L 3"]:
     """Resample a curve (..., T, L, 3) to (..., frames, L, 3) by linear interpolation.
 
     by="time": evenly spaced in time, which keeps the timing of onset and apex. by="arc": evenly spaced in arc length,
@@ -119,7 +129,9 @@ def resample(curve: jax.Array, *, frames: int, by: str = "time") -> jax.Array:
 
 
 @jax.jit
-def interpolate(curve: jax.Array, positions: jax.Array) -> jax.Array:
+def interpolate(
+    curve: Float[AnyArray, "*#lead T L 3"], positions: Real[AnyArray, "*#lead F"]
+) -> Float[Array, "*lead F L 3"]:
     """Interpolate a curve (..., T, L, 3) at positions (..., F), in frames, clipped to [0, T-1]: (..., F, L, 3)."""
     _check_curve(curve, 1)
     positions = jnp.clip(jnp.asarray(positions, curve.dtype), 0, curve.shape[-3] - 1)
@@ -127,7 +139,7 @@ def interpolate(curve: jax.Array, positions: jax.Array) -> jax.Array:
     return _read(curve, index.astype(jnp.int32), positions - index)
 
 
-def _read(curve: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
+def _read(curve: AnyArray, index: jax.Array, weight: jax.Array) -> jax.Array:
     """Return curve[index] + weight * (curve[index + 1] - curve[index]) for index and weight (..., F)."""
     lead = jnp.broadcast_shapes(curve.shape[:-3], index.shape[:-1])
     curve = jnp.broadcast_to(curve, lead + curve.shape[-3:])
@@ -138,14 +150,14 @@ def _read(curve: jax.Array, index: jax.Array, weight: jax.Array) -> jax.Array:
     return before + weight * (after - before)
 
 
-def _unit(points: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _unit(points: AnyArray) -> tuple[jax.Array, jax.Array]:
     """Divide arrays (..., K, D) by their largest entry (...), held constant: no square overflows or underflows.
 
     Functions that are independent of the size, or proportional to it, keep their values and gradients.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(points), axis=(-2, -1)))
     size = jnp.where(largest > jnp.finfo(largest.dtype).tiny, largest, 1)
-    return points / size[..., None, None], size
+    return jnp.asarray(points) / size[..., None, None], size
 
 
 @jax.custom_jvp
@@ -179,7 +191,7 @@ def _rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tupl
     return rotation, jnp.where(unique, rotation @ cross, 0)
 
 
-def _check_points(points: jax.Array, name: str, count: int | None = None) -> None:
+def _check_points(points: AnyArray, name: str, count: int | None = None) -> None:
     shape = jnp.shape(points)
     if len(shape) < 2 or shape[-1] != 3 or (count is not None and shape[-2] != count):
         wanted = "(..., K, 3)" if count is None else f"(..., {count}, 3)"
@@ -188,7 +200,7 @@ def _check_points(points: jax.Array, name: str, count: int | None = None) -> Non
         raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(points)}")
 
 
-def _check_curve(curve: jax.Array, least: int) -> None:
+def _check_curve(curve: AnyArray, least: int) -> None:
     shape = jnp.shape(curve)
     if len(shape) < 3 or shape[-3] < least:
         raise ValueError(f"expected a curve (..., T, L, 3) with T >= {least}, got shape {shape}")

@@ -34,9 +34,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array, Float, Float32, Float64, Real
 from scipy.linalg import lapack
-from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
+
+from facejax.geometry.sphere import AnyArray
 
 COINCIDENT = 1e-6  # of the landmarks' extent: nearer landmarks coincide, flatter sets are coplanar
 EXACT = 1e-6  # largest error of the solved system at a landmark, as a fraction of the displacement
@@ -54,14 +57,14 @@ class Rbf(NamedTuple):
     """The solved system of a rest pose."""
 
     kernel: str
-    centres: np.ndarray  # (L, 3) float64: landmarks about their centroid, in units
-    origin: np.ndarray  # (3,) the centroid
+    centres: Float64[np.ndarray, "L 3"]  # landmarks about their centroid, in units
+    origin: Float64[np.ndarray, " 3"]  # the centroid
     unit: float
-    inverse: np.ndarray  # (L + 4, L), or (L, L) without p: maps displacements to coefficients
+    inverse: Float64[np.ndarray, "E L"]  # E = L + 4, or L without p: maps displacements to coefficients
 
 
 def fit(
-    rest: np.ndarray,
+    rest: Real[AnyArray, "L 3"],
     *,
     kernel: str = "multiquadric",
     sigma: float | None = None,
@@ -112,7 +115,7 @@ def fit(
     return Rbf(kernel, centres, origin, unit, np.ascontiguousarray(inverse))
 
 
-def weights(fit: Rbf, vertices: np.ndarray) -> np.ndarray:
+def weights(fit: Rbf, vertices: Real[AnyArray, "N 3"]) -> Float32[np.ndarray, "N L"]:
     """Return the weights (N, L) float32 of the landmarks' displacements at vertices at rest (N, 3).
 
     A vertex at a landmark has one weight of 1. Computed in float64 on the host, once per face. Raises `ValueError` for
@@ -122,7 +125,9 @@ def weights(fit: Rbf, vertices: np.ndarray) -> np.ndarray:
 
 
 @jax.jit
-def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
+def warp(
+    weights: Float[AnyArray, "*#lead N L"], displacements: Float[AnyArray, "*#lead L 3"]
+) -> Float[Array, "*lead N 3"]:
     """Return the displacements (..., N, 3) of the vertices from those of the landmarks (..., L, 3) and weights (N, L).
 
     One matrix product for all frames. Weights (..., N, L) broadcast their leading axes with those of the displacements.
@@ -140,7 +145,9 @@ def warp(weights: jax.Array, displacements: jax.Array) -> jax.Array:
     return jnp.stack(axes, axis=-1)
 
 
-def apply(fit: Rbf, displacements: jax.Array, vertices: np.ndarray) -> jax.Array:
+def apply(
+    fit: Rbf, displacements: Float[AnyArray, "*lead L 3"], vertices: Real[AnyArray, "N 3"]
+) -> Float[Array, "*lead N 3"]:
     """Return the displacements (..., N, 3) of vertices at rest (N, 3), where the landmarks move by (..., L, 3).
 
     `displacements` may be traced by jit, vmap or grad. `vertices` may not: under jit compute `weights` outside.
@@ -149,7 +156,12 @@ def apply(fit: Rbf, displacements: jax.Array, vertices: np.ndarray) -> jax.Array
     return warp(_spread(fit, _points(vertices, "vertices"), np.float32), displacements)
 
 
-def refit(rest: np.ndarray, displacements: np.ndarray, vertices: np.ndarray, **options: Any) -> np.ndarray:
+def refit(
+    rest: Real[AnyArray, "L 3"],
+    displacements: Real[AnyArray, "T L 3"],
+    vertices: Real[AnyArray, "N 3"],
+    **options: Any,
+) -> Float32[np.ndarray, "T N 3"]:
     """Return displacements (T, N, 3) float32 with a new system for every frame, as in Seo & Luo (2021).
 
     Each step is interpolated from the previous positions of the landmarks (L, 3), displaced from rest by (T, L, 3), at
@@ -228,7 +240,7 @@ KERNELS = {
 }
 
 
-def _points(points: np.ndarray, name: str) -> np.ndarray:
+def _points(points: AnyArray, name: str) -> np.ndarray:
     """Return points as (K, 3) float64; raises for another shape, a tracer, and the first row that is not finite."""
     if isinstance(points, Tracer):
         raise ValueError(
@@ -252,7 +264,7 @@ def _spacing(rest: np.ndarray, affine: bool) -> float:
     if len(rest) < 2:
         raise ValueError("landmarks: expected at least 2, got 1")
     sizes = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
-    tree = cKDTree(rest)
+    tree = KDTree(rest)
     pairs = tree.query_pairs(COINCIDENT * sizes[0], output_type="ndarray")
     if len(pairs):
         a, b = min(map(tuple, pairs.tolist()))

@@ -1,8 +1,9 @@
 """The unit sphere of motions: exponential, logarithm, distance, geodesics, transport and means.
 
 Glossary
-    T   frames of a motion; a point has T-1 steps.
+    T   frames of a motion; a point has T-1 steps (S in signatures).
     L   landmarks.
+    C   in signatures: the 3 axes, or any number of coordinates from 2 on.
     p, q, r   points: arrays (..., T-1, L, 3) with inner(p, p) = 1, so their Frobenius norm is sqrt(T-1).
     u, v, w   tangent vectors at a point, of the same shape: inner(p, v) = 0.
 
@@ -26,11 +27,17 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
+
+AnyArray = jax.Array | np.ndarray
+"""What array functions accept: they are jitted, so that NumPy arrays become JAX arrays."""
 
 
 @jax.jit
-def safe_sqrt(squared: jax.Array) -> jax.Array:
+def safe_sqrt(squared: Float[AnyArray, "*shape"]) -> Float[Array, "*shape"]:
     """Return the square root of an array of any shape; 0, with derivative 0, where it is not positive."""
     # The argument is made safe before the root is taken: a `where` after it alone would propagate a NaN gradient.
     positive = squared > 0
@@ -38,7 +45,7 @@ def safe_sqrt(squared: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def inner(a: jax.Array, b: jax.Array) -> jax.Array:
+def inner(a: Float[AnyArray, "*#lead S L C"], b: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead"]:
     """Return the inner product (...) of a and b (..., T-1, L, 3): the sum over landmarks and axes, the mean over steps.
 
     Raises `ValueError` on shapes that end differently, or on a dtype that is not floating.
@@ -49,22 +56,22 @@ def inner(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def norm(a: jax.Array) -> jax.Array:
+def norm(a: Float[AnyArray, "*lead S L C"]) -> Float[Array, "*lead"]:
     """Return the norm (...) of a (..., T-1, L, 3); its gradient at 0 is 0."""
     return safe_sqrt(inner(a, a))
 
 
 @jax.jit
-def project(p: jax.Array, v: jax.Array) -> jax.Array:
+def project(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
     """Return the component (..., T-1, L, 3) of v tangent at the point p. p may have any length."""
     # Dividing by <p, p> costs one product and makes the result independent of rounding in the length of p.
     squared = inner(p, p)
     along = inner(p, v) / jnp.where(squared > 0, squared, 1)
-    return v - _wide(along) * p
+    return jnp.asarray(v) - _wide(along) * p
 
 
 @jax.jit
-def exp(p: jax.Array, v: jax.Array) -> jax.Array:
+def exp(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
     """Return the point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
 
     It has unit norm where v is tangent at p; `project` a vector that may not be.
@@ -74,7 +81,7 @@ def exp(p: jax.Array, v: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def log(p: jax.Array, q: jax.Array) -> jax.Array:
+def log(p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
     """Return the tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
     _check(p, q)
     along = _log(p, q)
@@ -82,7 +89,7 @@ def log(p: jax.Array, q: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def distance(p: jax.Array, q: jax.Array) -> jax.Array:
+def distance(p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead"]:
     """Return the angle (...) between p and q, in [0, pi]; its gradient is 0 at p = q and at p = -q."""
     _, _, squared, cosine, _ = _split(p, q)
     empty = (squared == 0) & (cosine == 0)
@@ -90,7 +97,9 @@ def distance(p: jax.Array, q: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
+def geodesic(
+    p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"], tau: Real[ArrayLike, "*#lead"]
+) -> Float[Array, "*lead S L C"]:
     """Return the point (..., T-1, L, 3) at the fraction tau (...) of the shortest arc from p to q.
 
     Equation 10 with its parentheses restored, (sin((1-tau) theta) p + sin(tau theta) q) / sin theta, written
@@ -107,7 +116,9 @@ def geodesic(p: jax.Array, q: jax.Array, tau: jax.Array | float) -> jax.Array:
 
 
 @jax.jit
-def transport(p: jax.Array, q: jax.Array, v: jax.Array) -> jax.Array:
+def transport(
+    p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]
+) -> Float[Array, "*lead S L C"]:
     """Transport the tangent vector v from p to q, parallel along their geodesic: (..., T-1, L, 3)."""
     # On tangent vectors at p, transport is the reflection across the hyperplane normal to p + q. A reflection
     # keeps lengths to the last digit, also near the antipode, where 1 + <p, q> would cancel.
@@ -115,11 +126,11 @@ def transport(p: jax.Array, q: jax.Array, v: jax.Array) -> jax.Array:
     middle = p + q
     antipode = _wide(inner(middle, middle) <= jnp.finfo(middle.dtype).eps ** 2)
     middle = jnp.where(antipode, _fixed_direction(p, inner(p, p)), middle)
-    return v - _wide(2 * inner(middle, v) / inner(middle, middle)) * middle
+    return jnp.asarray(v) - _wide(2 * inner(middle, v) / inner(middle, middle)) * middle
 
 
 @jax.jit
-def extrinsic_mean(qs: jax.Array) -> jax.Array:
+def extrinsic_mean(qs: Float[AnyArray, "*lead K S L C"]) -> Float[Array, "*lead S L C"]:
     """Return the mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3), normalised to the sphere.
 
     Where the mean vanishes, as that of two antipodes does, the first point is returned.
@@ -132,7 +143,9 @@ def extrinsic_mean(qs: jax.Array) -> jax.Array:
 
 
 @jax.jit(static_argnames=("steps",))
-def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = None) -> jax.Array:
+def karcher_mean(
+    qs: Float[AnyArray, "*lead K S L C"], *, steps: int = 100, tolerance: Real[ArrayLike, ""] | None = None
+) -> Float[Array, "*lead S L C"]:
     """Return the Fréchet mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3): of least summed squared distance.
 
     From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
@@ -148,7 +161,7 @@ def karcher_mean(qs: jax.Array, *, steps: int = 100, tolerance: float | None = N
     return _karcher(steps, qs, jnp.asarray(tolerance, qs.dtype))
 
 
-def _check(*points: jax.Array) -> None:
+def _check(*points: AnyArray) -> None:
     shapes = [jnp.shape(point) for point in points]
     if any(len(shape) < 3 for shape in shapes) or len({shape[-3:] for shape in shapes}) > 1:
         raise ValueError(f"expected arrays (..., T-1, L, 3) that end alike, got shapes {shapes}")
@@ -157,7 +170,7 @@ def _check(*points: jax.Array) -> None:
             raise ValueError(f"expected a floating dtype, got {jnp.result_type(point)}")
 
 
-def _check_set(qs: jax.Array) -> None:
+def _check_set(qs: AnyArray) -> None:
     if jnp.ndim(qs) < 4 or qs.shape[-4] == 0:
         raise ValueError(f"expected at least one point, (..., K, T-1, L, 3), got shape {jnp.shape(qs)}")
 
@@ -188,7 +201,7 @@ class _Along(NamedTuple):
     own: jax.Array  # <p, p>
 
 
-def _log(p: jax.Array, q: jax.Array) -> _Along:
+def _log(p: AnyArray, q: AnyArray) -> _Along:
     sign, lean, squared, cosine, own = _split(p, q)
     eps = jnp.finfo(squared.dtype).eps
     near = (cosine > 0) & (squared < eps**0.25 * cosine**2)
@@ -205,7 +218,7 @@ def _log(p: jax.Array, q: jax.Array) -> _Along:
     return _Along(jnp.where(antipode, jnp.pi, ratio), jnp.where(antipode, 1, squared), sign, lean, antipode, own)
 
 
-def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
+def _split(p: AnyArray, q: AnyArray) -> tuple[jax.Array, ...]:
     """Return sign, lean, |u|^2, <p, q> and <p, p>, where u = q - sign p - lean p is tangent at p."""
     cosine = inner(p, q)
     # Near p (or -p) the difference d is free of rounding, and projecting it instead of q keeps small angles to full
@@ -218,13 +231,13 @@ def _split(p: jax.Array, q: jax.Array) -> tuple[jax.Array, ...]:
     return sign, lean, squared, cosine, own
 
 
-def _tangent(p: jax.Array, q: jax.Array, along: _Along) -> jax.Array:
+def _tangent(p: AnyArray, q: AnyArray, along: _Along) -> jax.Array:
     """Return the vector (..., T-1, L, 3), tangent at p, that `_Along.scale` multiplies."""
     found = (q - _wide(along.sign) * p) - _wide(along.lean) * p
     return jnp.where(_wide(along.antipode), _fixed_direction(p, along.own), found)
 
 
-def _fixed_direction(p: jax.Array, own: jax.Array) -> jax.Array:
+def _fixed_direction(p: AnyArray, own: jax.Array) -> jax.Array:
     """Return a unit tangent vector at p: the first axis projected, or the second where p is nearer the first."""
     first = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 0].set(1)
     second = jnp.zeros(p.shape[-3:], p.dtype).at[0, 0, 1].set(1)
@@ -236,9 +249,9 @@ def _fixed_direction(p: jax.Array, own: jax.Array) -> jax.Array:
     return lax.stop_gradient(direction / _wide(jnp.sqrt((1 - lean * part) / steps)))
 
 
-def _flat(point: jax.Array) -> jax.Array:
+def _flat(point: AnyArray) -> jax.Array:
     """Flatten (..., T-1, L, 3) to (..., D)."""
-    return point.reshape(*point.shape[:-3], math.prod(point.shape[-3:]))
+    return jnp.reshape(point, (*point.shape[:-3], math.prod(point.shape[-3:])))
 
 
 def _pull(p: jax.Array, qs: jax.Array) -> jax.Array:
@@ -248,11 +261,11 @@ def _pull(p: jax.Array, qs: jax.Array) -> jax.Array:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _karcher(steps: int, qs: jax.Array, tolerance: jax.Array) -> jax.Array:
-    def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+    def unfinished(carry: tuple[int | jax.Array, jax.Array, jax.Array]) -> jax.Array:
         step, _, v = carry
         return (step < steps) & jnp.any(norm(v) > tolerance)
 
-    def move(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def move(carry: tuple[int | jax.Array, jax.Array, jax.Array]) -> tuple[int | jax.Array, jax.Array, jax.Array]:
         step, p, v = carry
         p = exp(p, v)
         # Rounding of the length of p would accumulate over the steps.

@@ -1,7 +1,8 @@
 """The square-root velocity function (SRVF): a landmark curve as a point on the sphere and the log of its length.
 
-A curve is (..., T, L, 3): T frames, evenly spaced in time over [0, 1], in any unit. Its steps are the T-1
-forward differences d, each taken as one vector of 3L numbers; its length is the sum of their norms. The point
+A curve is (..., T, L, 3): T frames, evenly spaced in time over [0, 1], in any unit. Its steps are the T-1 (in
+signatures, S) forward differences d, each taken as one vector of 3L numbers; its length is the sum of their norms. The
+point
 
     q = v / sqrt|v|,   v = (T-1) d / length                                (Otberdout et al. 2023, eq. 1)
 
@@ -19,8 +20,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
 
-from facejax.geometry.sphere import safe_sqrt
+from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 FLOOR = 1e-12
 """Length below which a curve counts as constant, in the curve's unit."""
@@ -29,7 +32,7 @@ BLOCK = 32  # steps
 
 
 @jax.jit
-def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
+def encode(curve: Float[AnyArray, "*lead T L 3"]) -> tuple[Float[Array, "*lead T-1 L 3"], Float[Array, "*lead"]]:
     """Encode a curve (..., T, L, 3) as q (..., T-1, L, 3) on the unit sphere, and log_length (...).
 
     Nothing is centred or scaled here (see `facejax.geometry.align.normalise`). Raises `ValueError` on fewer
@@ -59,7 +62,9 @@ def encode(curve: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 @jax.jit
-def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
+def decode(
+    q: Float[AnyArray, "*#lead S L 3"], log_length: Real[ArrayLike, "*#lead"], start: Real[AnyArray, "*#lead L 3"]
+) -> Float[Array, "*lead S+1 L 3"]:
     """Decode q (..., T-1, L, 3), log_length (...) and start (..., L, 3) to a curve (..., T, L, 3) in the unit of start.
 
     The inverse of `encode`. Each step is length q|q| / (T-1); the curve's length is exp(log_length) where q
@@ -74,14 +79,16 @@ def decode(q: jax.Array, log_length: jax.Array, start: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def displacement(q: jax.Array, log_length: jax.Array) -> jax.Array:
+def displacement(
+    q: Float[AnyArray, "*#lead S L 3"], log_length: Real[ArrayLike, "*#lead"]
+) -> Float[Array, "*lead S L 3"]:
     """Return the steps (..., T-1, L, 3) between frames, exp(log_length) q|q| / (T-1), for q (..., T-1, L, 3)."""
     _check(q, "q", "T-1", 1)
     return _pace(q, log_length)[..., None, None] * q
 
 
 @jax.jit
-def arc_length_fraction(q: jax.Array) -> jax.Array:
+def arc_length_fraction(q: Float[AnyArray, "*lead S L 3"]) -> Float[Array, "*lead S+1"]:
     """Return the fraction (..., T) of its arc length that the motion q (..., T-1, L, 3) has covered by each frame.
 
     Speed is |q|^2, so this is the time warp from constant speed to the motion. It runs from 0 to 1; for a constant
@@ -97,13 +104,13 @@ def arc_length_fraction(q: jax.Array) -> jax.Array:
 
 
 @jax.jit
-def length(curve: jax.Array) -> jax.Array:
+def length(curve: Float[AnyArray, "*lead T L 3"]) -> Float[Array, "*lead"]:
     """Return the length (...) of a curve (..., T, L, 3) in its own unit: the sum of the norms of its (L, 3) steps."""
     _check(curve, "curve", "T", 2)
     return jnp.sum(safe_sqrt(jnp.sum(jnp.diff(curve, axis=-3) ** 2, axis=(-2, -1))), axis=-1)
 
 
-def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
+def _check(array: AnyArray, name: str, axis: str, least: int) -> None:
     shape = jnp.shape(array)
     if len(shape) < 3 or shape[-1] != 3 or shape[-3] < least:
         raise ValueError(f"{name}: expected (..., {axis}, L, 3) with {axis} >= {least}, got shape {shape}")
@@ -111,12 +118,12 @@ def _check(array: jax.Array, name: str, axis: str, least: int) -> None:
         raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
 
 
-def _flat(curve: jax.Array) -> jax.Array:
+def _flat(curve: AnyArray) -> jax.Array:
     """Reshape (..., T, L, 3) to (..., T, 3 L): XLA's code for a CPU is slow where the last axis is short."""
-    return curve.reshape(*curve.shape[:-2], 3 * curve.shape[-2])
+    return jnp.reshape(curve, (*curve.shape[:-2], 3 * curve.shape[-2]))
 
 
-def _pace(q: jax.Array, log_length: jax.Array) -> jax.Array:
+def _pace(q: AnyArray, log_length: ArrayLike) -> jax.Array:
     """Return the factor (..., T-1) from q to its step, exp(log_length) |q| / (T-1)."""
     # q|q| is differentiable at 0, with derivative 0, and the safe root gives just that.
     norms = safe_sqrt(jnp.sum(_flat(q) ** 2, axis=-1))

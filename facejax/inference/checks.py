@@ -16,7 +16,7 @@ def check_intensity(intensity: float) -> None:
 
 
 def check_count(count: int) -> None:
-    """Raise `ValueError` for a number of sequences that a corpus cannot have."""
+    """Raise `ValueError` for a number of sequences outside 1..`MAX_SEQUENCES`."""
     if not 1 <= count <= MAX_SEQUENCES:
         raise ValueError(f"count: expected 1 to {MAX_SEQUENCES:,} sequences, got {count}")
 

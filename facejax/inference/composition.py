@@ -11,7 +11,7 @@ Displacements from neutral, unitless; S samples, P transitions of T frames each,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,7 @@ def compose(
     samples: int = 1,
     frames: int | Sequence[int] | None = None,
 ) -> jax.Array:
-    """Generate motions through label indices A, B, C, ...: (S, F, L, 3).
+    """Generate motions (S, F, L, 3) through label indices A, B, C, ...: chain several expressions, with C1 continuity.
 
     Sample i does not depend on the number of samples. Labels must be concrete when a function is traced; `draw` accepts
     traced ones.
@@ -100,11 +100,11 @@ def draw(generator: generators.Generator, starts: start_poses.StartPoses, keys: 
     """
     chart = jax.lax.stop_gradient(generator.chart)
 
-    def one(key):
+    def one(key: jax.Array) -> Drawn:
         first_key, key = jax.random.split(key)
         first = tangent_pca.decode_pose(chart, _start_pose(generator, starts, first_key, pairs[0, 0]), pairs[0, 0])
 
-        def transition(position, inputs):
+        def transition(position: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
             key, (start, end) = inputs
             curve, log_seconds = _transition(generator, starts, chart, key, position, start, end)
             return curve[-1], (curve, log_seconds)
@@ -160,14 +160,24 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
     return matrix.astype(np.float32)
 
 
-def _start_pose(generator, starts, key, label):
+def _start_pose(
+    generator: generators.Generator, starts: start_poses.StartPoses, key: jax.Array, label: jax.Array
+) -> jax.Array:
     if generators.uses_start_pose(generator):
         return start_poses.sample(starts, key, label)
     # A generator without a start pose starts at the mean peak, as in the paper.
     return jnp.zeros_like(generator.chart.pose_scale)
 
 
-def _transition(generator, starts, chart, key, position, start, end):
+def _transition(
+    generator: generators.Generator,
+    starts: start_poses.StartPoses,
+    chart: tangent_pca.TangentPCA,
+    key: jax.Array,
+    position: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
     pose = start_poses.clip_to_distribution(starts, tangent_pca.encode_pose(chart, position, start), start)
     motion = generators.sample(generator, key, start, end, pose)
     if not generators.uses_start_pose(generator):

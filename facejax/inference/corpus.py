@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from facejax.data import corpora
 from facejax.inference import checks, composition, pipeline
@@ -166,10 +167,19 @@ def maker(
 
 
 @jax.jit
-def _draw(motion: generators.Generator, starts: start_poses.StartPoses, key, pairs, timeline, rest, numbers, intensity):
+def _draw(
+    motion: generators.Generator,
+    starts: start_poses.StartPoses,
+    key: jax.Array,
+    pairs: jax.Array,
+    timeline: jax.Array,
+    rest: jax.Array,
+    numbers: jax.Array,
+    intensity: ArrayLike,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return landmarks (S, T, L, 3), labels (S, P + 1) and person (S,) of the sequences with these numbers (S,)."""
 
-    def choose(key):
+    def choose(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         pair_key, person_key = jax.random.split(jax.random.fold_in(key, len(pairs)))
         return jax.random.randint(pair_key, (), 0, len(pairs)), jax.random.randint(person_key, (), 0, len(rest))
 

@@ -10,12 +10,14 @@ centred neutral landmarks, in the face's frame (y up, z forward). `inference.ret
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from importlib import resources
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 from facejax.inference import checks
 from facejax.io import weights
@@ -36,7 +38,7 @@ class Expressions(NamedTuple):
     about: dict[str, Any]  # provenance
 
 
-def load(path: str | os.PathLike | None = None) -> Expressions:
+def load(path: str | os.PathLike[str] | None = None) -> Expressions:
     """Read the released networks, or those of a file. Raises `weights.WeightsError`."""
     file: Any = path or resources.files("facejax.assets").joinpath(RELEASED)
     about = weights.load_metadata(file)
@@ -51,7 +53,7 @@ def load(path: str | os.PathLike | None = None) -> Expressions:
     return Expressions(labels, params, config, rate, frames, about["about"])
 
 
-def save(path: str | os.PathLike, networks: Expressions) -> None:
+def save(path: str | os.PathLike[str], networks: Expressions) -> None:
     """Write networks to one safetensors file, in half precision: curves change by a relative 2e-4."""
     halved = jax.tree.map(lambda leaf: np.asarray(leaf, np.float16), networks.params.weights)
     described = {
@@ -119,7 +121,7 @@ def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.Ex
     scale = expression_lstm.Scale(jnp.ones(()), jnp.zeros((config.landmarks, 3)), jnp.ones(()), jnp.ones(()), basis)
     one = jax.eval_shape(lambda: expression_lstm.init(jax.random.key(0), scale, config=config))
 
-    def stacked(dtype):
+    def stacked(dtype: DTypeLike) -> Callable[[jax.Array], jax.ShapeDtypeStruct]:
         return lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape), dtype)
 
     return expression_lstm.ExpressionLSTM(

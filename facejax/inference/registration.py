@@ -18,6 +18,7 @@ from facejax.geometry import host
 from facejax.geometry.interpolation import smoothstep
 from facejax.mesh import closest_point, graph
 from facejax.mesh.normals import vertex_normals_host
+from facejax.models import pca
 
 MODEL_ITERATIONS = 10  # of matching, for the morphable model
 EFFECTIVE_MATCHES = 400.0  # independent matches of 1 mm that all together count as: neighbours are correlated
@@ -64,12 +65,11 @@ def fit_head_model(
     placed = np.stack([_onto(face, face[landmark_index], mean[landmark_index]) for face in people])
     mean = placed.mean(axis=0)
     flat = (placed - mean).reshape(len(people), -1)
-    gram = flat @ flat.T / len(people)
-    values, vectors = np.linalg.eigh(gram)
-    order = np.argsort(values)[::-1][: min(components, len(people) - 1)]
-    # Rows of unit norm are vectors.T @ flat / sqrt(M value); times the standard deviation sqrt(value).
-    rows = vectors[:, order].T @ flat / np.sqrt(len(people))
-    return HeadModel(mean, rows.reshape(len(order), *mean.shape), np.asarray(faces), np.asarray(landmark_index))
+    _, vectors = pca.from_covariance(flat @ flat.T / len(people))
+    count = min(components, len(people) - 1)
+    # Rows of unit norm are vectors.T @ flat / sqrt(M variance); times the standard deviation sqrt(variance).
+    rows = vectors[:, :count].T @ flat / np.sqrt(len(people))
+    return HeadModel(mean, rows.reshape(count, *mean.shape), np.asarray(faces), np.asarray(landmark_index))
 
 
 def fit(

@@ -12,7 +12,7 @@ N vertices, F triangles, L landmarks of the mesh, C landmarks that it shares wit
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ def prepare(
     *,
     pin: bool = True,
     name: str = "the mesh",
-    **options,
+    **options: Any,
 ) -> Face:
     """Locate the face of a mesh by its landmarks, and compute the weights that animate it.
 
@@ -138,7 +138,15 @@ def _move(vertices: jax.Array, weights: jax.Array, displacements: jax.Array) -> 
     return vertices + rbf.warp(weights, displacements)
 
 
-def _weights(vertices, triangles, points, names, count, pin, options) -> tuple[np.ndarray, int]:
+def _weights(
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    points: np.ndarray,
+    names: np.ndarray,
+    count: int,
+    pin: bool,
+    options: dict[str, Any],
+) -> tuple[np.ndarray, int]:
     """Return weights (N, C) of the points (C, 3), and the number of vertices without a triangle.
 
     Coincident vertices are merged first: texture seams are not rims, and paths along the mesh cross them.

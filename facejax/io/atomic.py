@@ -5,12 +5,12 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 
 @contextlib.contextmanager
-def replace_file(path: str | os.PathLike) -> Iterator[Path]:
+def replace_file(path: str | os.PathLike[str]) -> Generator[Path]:
     """Yield a temporary path in the same folder, with the same suffix, that replaces `path` on success.
 
     The folder is created if it is missing. After an error or an interruption, an existing file is unchanged.
@@ -31,7 +31,7 @@ def replace_file(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replace_folder(path: str | os.PathLike) -> Iterator[Path]:
+def replace_folder(path: str | os.PathLike[str]) -> Generator[Path]:
     """Yield a temporary folder beside `path` that replaces it on success.
 
     An existing folder is removed only once the new one is complete.
@@ -49,7 +49,7 @@ def replace_folder(path: str | os.PathLike) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def sha256(path: str | os.PathLike) -> str:
+def sha256(path: str | os.PathLike[str]) -> str:
     """Return the SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

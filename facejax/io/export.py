@@ -1,9 +1,11 @@
 """Export of animations and still faces; the suffix of the path selects the format."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from facejax.io import atomic, glb_writer, meshes
@@ -13,18 +15,18 @@ CONTACT_SHEET_FRAMES = 8
 
 
 def save(
-    path: str | os.PathLike,
-    vertices,
-    faces,
+    path: str | os.PathLike[str],
+    vertices: ArrayLike,
+    faces: ArrayLike,
     *,
-    fps=30.0,
-    captions=(),
-    title=None,
-    landmarks=None,
-    extras=(),
-    colours=None,
-    size=(320, 400),
-    camera=None,
+    fps: float = 30.0,
+    captions: scene.Captions = (),
+    title: str | None = None,
+    landmarks: ArrayLike | None = None,
+    extras: Sequence[scene.PartLike] = (),
+    colours: ArrayLike | None = None,
+    size: tuple[int, int] = (320, 400),
+    camera: render.Camera | None = None,
 ) -> None:
     """Save an animation or a still face, atomically, in the format of the path's suffix.
 
@@ -57,17 +59,18 @@ def save(
     elif suffix == ".glb":
         glb_writer.write(path, *shot[:2], fps=fps, captions=captions, extras=extras, name=title)
     elif suffix == ".html":
-        texts = {"fps": fps, "captions": captions, "title": title}
-        html_viewer.write(path, *shot[:2], **texts, landmarks=shot.landmarks, extras=extras, colours=colours)
+        html_viewer.write(
+            path, *shot[:2], fps=fps, captions=captions, title=title,
+            landmarks=shot.landmarks, extras=extras, colours=colours,
+        )  # fmt: skip
     elif suffix in video.FORMATS or suffix == ".png":
         if suffix != ".png":
             video.check(path)
         view = render.fit_camera(shot.vertices, size=size) if camera is None else camera
-        look = {"size": size, "camera": view}
         if suffix == ".png":
-            _write_picture(path, shot, colours, look)
+            _write_picture(path, shot, colours, size, view)
         else:
-            pictures = _pictures(shot, colours, look)
+            pictures = _pictures(shot, colours, size, view)
             video.write(path, render.caption(pictures, shot.captions) if shot.captions else pictures, fps=fps)
     elif suffix == ".npz":
         _write_arrays(path, shot)
@@ -82,11 +85,15 @@ def save(
         raise ValueError(f"{path}: unknown format {suffix!r}; expected {known}")
 
 
-def _pictures(shot: scene.Scene, colours, look: dict) -> np.ndarray:
-    return render.frames(*shot[:2], landmarks=shot.landmarks, extras=shot.extras, colours=colours, **look)
+def _pictures(shot: scene.Scene, colours: ArrayLike | None, size: tuple[int, int], camera: render.Camera) -> np.ndarray:
+    return render.frames(
+        *shot[:2], landmarks=shot.landmarks, extras=shot.extras, colours=colours, size=size, camera=camera
+    )
 
 
-def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
+def _write_picture(
+    path: Path, shot: scene.Scene, colours: ArrayLike | None, size: tuple[int, int], camera: render.Camera
+) -> None:
     count = len(shot.vertices)
     chosen = np.unique(np.linspace(0, count - 1, CONTACT_SHEET_FRAMES).round().astype(int))
     if colours is not None and np.ndim(colours) == 3:
@@ -96,15 +103,17 @@ def _write_picture(path: Path, shot: scene.Scene, colours, look: dict) -> None:
     ]
     marks = None if shot.landmarks is None else shot.landmarks[chosen]
     still = shot._replace(vertices=shot.vertices[chosen], landmarks=marks, extras=extras)
-    pictures = _pictures(still, colours, look)
+    pictures = _pictures(still, colours, size, camera)
     if count > 1:
         labels = [_label(t, shot.captions) for t in chosen]
-        pictures = [render.contact_sheet([pictures], column_labels=labels)]
+        picture = render.contact_sheet([pictures], column_labels=labels)
+    else:
+        picture = pictures[0]
     with atomic.replace_file(path) as temporary:
-        Image.fromarray(pictures[0]).save(temporary)
+        Image.fromarray(picture).save(temporary)
 
 
-def _label(frame: int, captions) -> str:
+def _label(frame: int, captions: scene.Captions) -> str:
     """Return the frame's number, from 1, and its caption."""
     return ": ".join([str(frame + 1)] + [text for start, text in captions if start <= frame][-1:])
 
@@ -113,8 +122,9 @@ def _write_arrays(path: Path, shot: scene.Scene) -> None:
     if len(shot.vertices) == 1:
         meshes.write(path, shot.vertices[0], shot.faces)
         return
-    arrays = {"vertices": shot.vertices, "faces": shot.faces.astype(np.int32), "fps": np.float64(shot.fps)}
-    if shot.landmarks is not None:
-        arrays["landmarks"] = shot.landmarks
+    faces, fps = shot.faces.astype(np.int32), np.float64(shot.fps)
     with atomic.replace_file(path) as temporary:
-        np.savez(temporary, **arrays)
+        if shot.landmarks is None:
+            np.savez(temporary, vertices=shot.vertices, faces=faces, fps=fps)
+        else:
+            np.savez(temporary, vertices=shot.vertices, faces=faces, fps=fps, landmarks=shot.landmarks)

@@ -13,10 +13,13 @@ the file size before memory is allocated. Numbers in parentheses, such as (3.6.2
 import json
 import math
 import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+_Object = dict[str, Any]  # of JSON in a file that may be hostile: nothing is known of its values
 _MAX_JSON_BYTES = 2**25  # a face with a minute of animation takes a quarter of a megabyte
 _MAX_COUNT = 2**23  # vertices, or corners of triangles
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -53,7 +56,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, faces[:, ::-1] if mirrored else faces
 
 
-def _chunks(data: bytes) -> tuple[dict, bytes]:
+def _chunks(data: bytes) -> tuple[_Object, bytes]:
     """The document and its binary chunk (4.4)."""
     if len(data) < 20 or data[:4] != b"glTF":
         raise ValueError("is not a GLB file (no header)")
@@ -62,7 +65,8 @@ def _chunks(data: bytes) -> tuple[dict, bytes]:
         raise ValueError(f"unsupported glTF version {version}, expected 2")
     if size != len(data):
         raise ValueError(f"header claims {size} bytes, the file holds {len(data)}")
-    chunks, at = [], 12
+    chunks: list[tuple[int, int, int]] = []  # kind, start, length
+    at = 12
     while at < size:
         if at + 8 > size:
             raise ValueError(f"ends early: {size - at} bytes where a chunk should begin")
@@ -88,7 +92,7 @@ def _chunks(data: bytes) -> tuple[dict, bytes]:
     return document, binary
 
 
-def _largest(document: dict) -> tuple[dict, np.ndarray]:
+def _largest(document: _Object) -> tuple[_Object, np.ndarray]:
     """Return the mesh with the most triangles, and its transform (4, 4) to the scene."""
     meshes = document["meshes"]
     counts = [_count(document, mesh) for mesh in meshes]
@@ -102,7 +106,7 @@ def _largest(document: dict) -> tuple[dict, np.ndarray]:
     return meshes[best], matrix
 
 
-def _instances(document: dict):
+def _instances(document: _Object) -> Iterator[tuple[int, np.ndarray]]:
     """Yield (mesh, transform) of every node of the scene that has a mesh, depth first (3.5.2)."""
     nodes, scenes = document["nodes"], document["scenes"]
     if scenes:
@@ -123,7 +127,7 @@ def _instances(document: dict):
             yield _integer(node["mesh"], len(document["meshes"]), "mesh"), np.eye(4) if "skin" in node else matrix
 
 
-def _matrix(node: dict) -> np.ndarray:
+def _matrix(node: _Object) -> np.ndarray:
     """Return a node's local transform: its matrix by columns, or translation * rotation * scale (3.5.2)."""
     if "matrix" in node:
         return np.array(_floats(node["matrix"], 16, "matrix")).reshape(4, 4).T
@@ -139,7 +143,7 @@ def _matrix(node: dict) -> np.ndarray:
     return matrix
 
 
-def _count(document: dict, mesh: dict) -> int:
+def _count(document: _Object, mesh: _Object) -> int:
     """Return the number of triangles of a mesh that its accessors declare."""
     total = 0
     for primitive in mesh["primitives"]:
@@ -149,12 +153,12 @@ def _count(document: dict, mesh: dict) -> int:
     return total
 
 
-def _drawn(primitive: dict) -> bool:
+def _drawn(primitive: _Object) -> bool:
     """Return whether a primitive has positions, and consists of triangles, not of points or lines."""
     return primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN) and "POSITION" in primitive["attributes"]
 
 
-def _join(document: dict, binary: bytes, mesh: dict) -> tuple[np.ndarray, np.ndarray]:
+def _join(document: _Object, binary: bytes, mesh: _Object) -> tuple[np.ndarray, np.ndarray]:
     parts, first, faces, total = [], {}, [np.zeros((0, 3), np.int64)], 0
     for primitive in mesh["primitives"]:
         if not _drawn(primitive):
@@ -189,13 +193,13 @@ def _triangles(index: np.ndarray, mode: int) -> np.ndarray:
     return np.stack([index[at], index[at + 1 + odd], index[at + 2 - odd]], -1)
 
 
-def _accessor(document: dict, which) -> dict:
+def _accessor(document: _Object, which: Any) -> _Object:
     record = document["accessors"][_integer(which, len(document["accessors"]), "accessor")]
     _integer(record["count"], _MAX_COUNT + 1, "count of an accessor")
     return record
 
 
-def _values(document: dict, binary: bytes, which: int, shape: str) -> np.ndarray:
+def _values(document: _Object, binary: bytes, which: int, shape: str) -> np.ndarray:
     """Return an accessor's values (count, columns), with sparse replacements applied (3.6.2)."""
     record = _accessor(document, which)
     kind, count, columns = _kind(record), record["count"], _COLUMNS[shape]
@@ -220,13 +224,13 @@ def _values(document: dict, binary: bytes, which: int, shape: str) -> np.ndarray
     return values.astype(np.float64)
 
 
-def _kind(record: dict) -> np.dtype:
+def _kind(record: _Object) -> np.dtype:
     if record["componentType"] not in _TYPES:
         raise ValueError(f"componentType must be one of {', '.join(map(str, _TYPES))}, got {record['componentType']}")
     return np.dtype(_TYPES[record["componentType"]])
 
 
-def _view(document: dict, binary: bytes, place: dict, kind: np.dtype, count: int, columns: int) -> np.ndarray:
+def _view(document: _Object, binary: bytes, place: _Object, kind: np.dtype, count: int, columns: int) -> np.ndarray:
     """Return `count` rows of the binary chunk at a place: a view and an offset in it."""
     views, buffers = document["bufferViews"], document["buffers"]
     view = views[_integer(place["bufferView"], len(views), "bufferView")]
@@ -241,13 +245,13 @@ def _view(document: dict, binary: bytes, place: dict, kind: np.dtype, count: int
     return np.ndarray((count, columns), kind, binary, start + offset if count else 0, (stride, kind.itemsize))
 
 
-def _integer(value, limit: int, what: str) -> int:
+def _integer(value: Any, limit: int, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
         raise ValueError(f"{what} must be an integer in 0..{limit - 1}, got {str(value)[:40]}")
     return value
 
 
-def _floats(values, count: int, what: str) -> list[float]:
+def _floats(values: Any, count: int, what: str) -> list[float]:
     if len(values) != count or not all(math.isfinite(value) for value in values):
         raise ValueError(f"{what} must be {count} finite numbers, got {str(values)[:60]}")
     return [float(value) for value in values]

@@ -7,28 +7,32 @@ weights of the targets one after another. The unit of glTF is the metre.
 import json
 import os
 import struct
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.io import atomic
 from facejax.viz import scene, shading
 
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTEX_DATA, _INDEX_DATA = 34962, 34963
+_Object = dict[str, Any]  # of JSON
 _SHAPES = {1: "SCALAR", 3: "VEC3"}
 
 
 def write(
-    path: str | os.PathLike,
-    vertices,
-    faces,
+    path: str | os.PathLike[str],
+    vertices: ArrayLike,
+    faces: ArrayLike,
     *,
-    fps=30.0,
-    normals=True,
-    sparse=True,
-    name="face",
-    captions=(),
-    extras=(),
+    fps: float = 30.0,
+    normals: bool = True,
+    sparse: bool = True,
+    name: str = "face",
+    captions: scene.Captions = (),
+    extras: Sequence[scene.PartLike] = (),
 ) -> None:
     """Write one animation, atomically.
 
@@ -62,8 +66,8 @@ class _Buffers:
 
     def __init__(self):
         self.data = bytearray()
-        self.views: list[dict] = []
-        self.accessors: list[dict] = []
+        self.views: list[_Object] = []
+        self.accessors: list[_Object] = []
 
     def view(self, array: np.ndarray, target: int | None = None) -> int:
         self.data += bytes(-len(self.data) % 4)
@@ -72,11 +76,11 @@ class _Buffers:
         self.data += array.tobytes()
         return len(self.views) - 1
 
-    def accessor(self, array: np.ndarray, target: int | None = None, *, sparse=False) -> int:
+    def accessor(self, array: np.ndarray, target: int | None = None, *, sparse: bool = False) -> int:
         """Add values (n,) or (n, 3), float32 or unsigned, and return the index of their accessor."""
         kind = {"f4": _FLOAT, "u2": _UINT16, "u4": _UINT32}[array.dtype.str[1:]]
         columns = array.reshape(len(array), -1)
-        record = {"componentType": kind, "count": len(array), "type": _SHAPES[columns.shape[1]]}
+        record: _Object = {"componentType": kind, "count": len(array), "type": _SHAPES[columns.shape[1]]}
         record |= {"min": columns.min(0).tolist(), "max": columns.max(0).tolist()}
         moved = np.flatnonzero(columns.any(1)) if sparse else np.arange(len(array))
         index = moved.astype(_index_type(len(array)))
@@ -97,7 +101,7 @@ class _Buffers:
         return len(self.accessors) - 1
 
 
-def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tuple[dict, bytes]:
+def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tuple[_Object, bytes]:
     buffers, count = _Buffers(), len(film.vertices)
     skin = scene.Part(film.vertices, film.faces, np.asarray(scene.SKIN, np.float32), 0.3)
     meshes, materials, moving = [], [], []
@@ -133,7 +137,7 @@ def _document(film: scene.Scene, name: str, normals: bool, sparse: bool) -> tupl
     return document, bytes(buffers.data)
 
 
-def _mesh(buffers: _Buffers, part: scene.Part, name: str, material: int, normals: bool, sparse: bool) -> dict:
+def _mesh(buffers: _Buffers, part: scene.Part, name: str, material: int, normals: bool, sparse: bool) -> _Object:
     frames = part.vertices if part.vertices.ndim == 3 else part.vertices[None]
     columns = {"POSITION": (frames / np.float32(1000)).astype(np.float32)}
     if normals:
@@ -142,12 +146,12 @@ def _mesh(buffers: _Buffers, part: scene.Part, name: str, material: int, normals
     if np.ndim(part.colour) == 2:
         attributes["COLOR_0"] = buffers.accessor(shading.linear(np.asarray(part.colour)), _VERTEX_DATA)
     index = part.faces.ravel().astype(_index_type(frames.shape[1]))
-    primitive = {
+    primitive: _Object = {
         "attributes": attributes,
         "indices": buffers.accessor(index, _INDEX_DATA),
         "material": material,
     }
-    mesh = {"name": name, "primitives": [primitive]}
+    mesh: _Object = {"name": name, "primitives": [primitive]}
     if len(frames) > 1:
         primitive["targets"] = [
             {
@@ -161,7 +165,7 @@ def _mesh(buffers: _Buffers, part: scene.Part, name: str, material: int, normals
     return mesh
 
 
-def _material(part: scene.Part, name: str) -> dict:
+def _material(part: scene.Part, name: str) -> _Object:
     colour = shading.linear(np.asarray(part.colour)).tolist() if np.ndim(part.colour) == 1 else [1.0, 1.0, 1.0]
     surface = {
         "baseColorFactor": [*colour, 1.0],
@@ -176,7 +180,7 @@ def _index_type(size: int) -> type:
     return np.uint16 if size < 0xFFFF else np.uint32
 
 
-def _glb(document: dict, data: bytes) -> bytes:
+def _glb(document: _Object, data: bytes) -> bytes:
     text = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     size = 12 + 8 + len(text) + 8 + len(data)

@@ -16,11 +16,13 @@ import json
 import math
 import os
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.parsers import expat
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.io import atomic, errors, flame_embedding
 
@@ -44,7 +46,7 @@ class Landmarks(NamedTuple):
     names: tuple[str, ...] | None = None  # (L,)
 
 
-def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
+def read(path: str | os.PathLike[str], vertices: ArrayLike | None = None, faces: ArrayLike | None = None) -> Landmarks:
     """Read the landmarks of a mesh in the format of the file's suffix.
 
     Args:
@@ -67,7 +69,7 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
         size = path.stat().st_size
         if not 0 < size <= MAX_BYTES:
             raise LandmarkError(f"{path}: {size} bytes; expected 1 to {MAX_BYTES}")
-        found = reader(path if reader is _read_embedding else path.read_bytes(), mesh, faces)
+        found = reader(path, mesh, faces)
         if mesh is not None:
             _check_distance(found.points, mesh)
     except LandmarkError:
@@ -79,7 +81,10 @@ def read(path: str | os.PathLike, vertices=None, faces=None) -> Landmarks:
     return found
 
 
-def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> None:
+def write(
+    path: str | os.PathLike[str], *, index: ArrayLike | None = None, points: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+) -> None:  # fmt: skip
     """Write vertex indices (L,) or positions (L, 3), and optional names (L,), as .json, atomically and without loss.
 
     Raises:
@@ -105,9 +110,9 @@ def write(path: str | os.PathLike, *, index=None, points=None, names=None) -> No
         temporary.write_text(json.dumps(record), encoding="utf-8")
 
 
-def _read_json(data: bytes, mesh, faces) -> Landmarks:
+def _read_json(path: Path, mesh: np.ndarray | None, faces: ArrayLike | None) -> Landmarks:
     try:
-        record = json.loads(data.decode("utf-8-sig"))
+        record = json.loads(path.read_bytes().decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise ValueError("not UTF-8 text") from None
     except (json.JSONDecodeError, RecursionError) as error:
@@ -121,26 +126,22 @@ def _read_json(data: bytes, mesh, faces) -> Landmarks:
     rows = [_list(record[key], key) for key in kinds[0]]
     if kinds[0] == ("indices",):
         index = np.array([_index(v, f"indices[{i}]", mesh) for i, v in enumerate(rows[0])], np.int32)
+        assert mesh is not None  # `_index` raises without one
         found = Landmarks(mesh[index], index)
     elif kinds[0] == ("points",):
         points = [_numbers(v, f"points[{i}]") for i, v in enumerate(rows[0])]
         found = Landmarks(np.array(points, np.float64), None)
     else:
-        found = Landmarks(_from_barycentric(rows[0], rows[1], mesh, faces), None)
+        if len(rows[0]) != len(rows[1]):
+            raise ValueError(f"{len(rows[0])} faces but {len(rows[1])} weights")
+        weights = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(rows[1])], np.float64)
+        found = Landmarks(_interpolate(rows[0], weights, mesh, faces), None)
     if "names" in record:
         found = found._replace(names=tuple(_names(record["names"], len(found.points))))
     return found
 
 
-def _from_barycentric(face: list, weights: list, mesh, faces) -> np.ndarray:
-    """Return the positions (L, 3) of barycentric landmarks."""
-    if len(face) != len(weights):
-        raise ValueError(f"{len(face)} faces but {len(weights)} weights")
-    table = np.array([_numbers(v, f"weights[{i}]") for i, v in enumerate(weights)], np.float64)
-    return _interpolate(face, table, mesh, faces)
-
-
-def _interpolate(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
+def _interpolate(face: list[Any], weights: np.ndarray, mesh: np.ndarray | None, faces: ArrayLike | None) -> np.ndarray:
     if mesh is None or faces is None:
         raise ValueError("barycentric landmarks need the mesh's vertices and faces")
     faces = np.asarray(faces)
@@ -151,18 +152,18 @@ def _interpolate(face, weights: np.ndarray, mesh, faces) -> np.ndarray:
     return np.einsum("lk,lkx->lx", weights, mesh[faces[index]])
 
 
-def _read_embedding(path: Path, mesh, faces) -> Landmarks:
+def _read_embedding(path: Path, mesh: np.ndarray | None, faces: ArrayLike | None) -> Landmarks:
     face, weights = flame_embedding.read(path)
     if not 0 < len(face) <= MAX_LANDMARKS:
         raise ValueError(f"expected 1 to {MAX_LANDMARKS} landmarks, got {len(face)}")
     return Landmarks(_interpolate(face.tolist(), weights, mesh, faces), None)
 
 
-def _read_pp(data: bytes, mesh, faces) -> Landmarks:
+def _read_pp(path: Path, mesh: np.ndarray | None, faces: ArrayLike | None) -> Landmarks:
     parser = expat.ParserCreate()
     tags, points, names = set(), [], []
 
-    def start(tag, attributes):
+    def start(tag: str, attributes: dict[str, str]) -> None:
         line = f"line {parser.CurrentLineNumber}"
         if not tags and tag != "PickedPoints":
             raise ValueError(f"{line}: expected PickedPoints, got {tag[:40]!r}")
@@ -180,24 +181,24 @@ def _read_pp(data: bytes, mesh, faces) -> Landmarks:
         names.append(name)
 
     # MeshLab writes a bare <!DOCTYPE PickedPoints>. Declarations could expand entities or read files: rejected.
-    def doctype(name, system, public, has_subset):
+    def doctype(name: str, system: str | None, public: str | None, has_subset: bool) -> None:
         if system or public or has_subset:
             raise ValueError(f"line {parser.CurrentLineNumber}: a DOCTYPE with declarations is not allowed")
 
-    def entity(*_):
+    def entity(*_: Any) -> None:
         raise ValueError(f"line {parser.CurrentLineNumber}: entities are not allowed")
 
     parser.StartElementHandler, parser.StartDoctypeDeclHandler, parser.EntityDeclHandler = start, doctype, entity
     try:
-        parser.Parse(data, True)
+        parser.Parse(path.read_bytes(), True)
     except (expat.ExpatError, LookupError) as error:
         raise ValueError(f"not XML: {error}") from None
     return Landmarks(np.array(_list(points, "points"), np.float64), None, tuple(names))
 
 
-def _read_text(data: bytes, mesh, faces) -> Landmarks:
+def _read_text(path: Path, mesh: np.ndarray | None, faces: ArrayLike | None) -> Landmarks:
     index, points, form = [], [], None
-    for number, line in enumerate(data.decode("utf-8-sig", errors="replace").splitlines(), 1):
+    for number, line in enumerate(path.read_bytes().decode("utf-8-sig", errors="replace").splitlines(), 1):
         words = [word for word in re.split(r"[\s,;]+", line.partition("#")[0]) if word]
         if not words:
             continue
@@ -230,20 +231,20 @@ def _read_text(data: bytes, mesh, faces) -> Landmarks:
     return Landmarks(mesh[numbers], numbers)
 
 
-def _list(values, what: str) -> list:
+def _list(values: Any, what: str) -> list[Any]:
     if not isinstance(values, list) or not 0 < len(values) <= MAX_LANDMARKS:
         got = f"{len(values)}" if isinstance(values, list) else type(values).__name__
         raise ValueError(f"{what}: expected a list of 1 to {MAX_LANDMARKS} landmarks, got {got}")
     return values
 
 
-def _names(values, count: int) -> list[str]:
+def _names(values: Any, count: int) -> list[str]:
     if not isinstance(values, list) or len(values) != count or not all(isinstance(v, str) for v in values):
         raise ValueError(f"names: expected {count} strings, one for each landmark")
     return values
 
 
-def _integer(value, where: str, count: int, what: str) -> int:
+def _integer(value: Any, where: str, count: int, what: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise ValueError(f"{where}: expected an integer, got {str(value)[:40]!r}")
     if not 0 <= value < count:
@@ -251,19 +252,19 @@ def _integer(value, where: str, count: int, what: str) -> int:
     return value
 
 
-def _index(value, where: str, mesh) -> int:
+def _index(value: Any, where: str, mesh: np.ndarray | None) -> int:
     if mesh is None:
         raise ValueError("landmarks given as vertex indices need the mesh's vertices")
     return _integer(value, where, len(mesh), "vertices")
 
 
-def _numbers(value, where: str) -> list[float]:
+def _numbers(value: Any, where: str) -> list[float]:
     if not isinstance(value, list) or len(value) != 3:
         raise ValueError(f"{where}: expected 3 numbers, got {str(value)[:60]!r}")
     return [_number(v, where) for v in value]
 
 
-def _number(value, where: str) -> float:
+def _number(value: Any, where: str) -> float:
     try:
         number = math.nan if isinstance(value, (bool, list, dict)) or value is None else float(value)
     except (ValueError, OverflowError):
@@ -289,10 +290,9 @@ def _diagonal(mesh: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(mesh, axis=0)))
 
 
-_TEXT_SUFFIXES = (".txt", ".csv", ".xyz", ".lnd", ".bnd")
-_READERS = {
+_READERS: dict[str, Callable[[Path, np.ndarray | None, ArrayLike | None], Landmarks]] = {
     ".json": _read_json,
     ".pp": _read_pp,
-    **dict.fromkeys(_TEXT_SUFFIXES, _read_text),
+    **dict.fromkeys((".txt", ".csv", ".xyz", ".lnd", ".bnd"), _read_text),
     **dict.fromkeys(flame_embedding.SUFFIXES, _read_embedding),
 }

@@ -69,7 +69,7 @@ class Recording(NamedTuple):
     notes: tuple[str, ...] = ()  # assumptions and dropped rows, one line each
 
 
-def read(path: str | os.PathLike, *, base: int | None = None, trust_sides: bool = False) -> Recording:
+def read(path: str | os.PathLike[str], *, base: int | None = None, trust_sides: bool = False) -> Recording:
     """Read a recording. Rows without a face and duplicate times are dropped, the others sorted by time.
 
     Args:

@@ -7,10 +7,12 @@ be untrusted: counts are checked against the file size before memory is allocate
 import array
 import os
 import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.io import atomic, errors, glb_reader, npz, ply
 from facejax.io.npz import DAMAGE_ERRORS, MAX_BYTES
@@ -18,6 +20,8 @@ from facejax.io.npz import DAMAGE_ERRORS, MAX_BYTES
 _MAX_OBJ_BYTES = 2**26
 _MAX_LINE_CHARS = 2**20
 _FRAME_NAME = re.compile(r"\d{6,}\.(ply|obj|npz)")
+_Wanted = TypeVar("_Wanted")
+_Found = TypeVar("_Found")
 
 
 class MeshError(errors.FileError):
@@ -31,7 +35,7 @@ class Mesh(NamedTuple):
     faces: np.ndarray | None  # (F, 3) int32
 
 
-def read(path: str | os.PathLike) -> Mesh:
+def read(path: str | os.PathLike[str]) -> Mesh:
     """Read a mesh; the suffix is .ply, .obj, .glb, .npz (`vertices`, optional `faces`) or .npy (vertices).
 
     Of a .glb, whose unit is the metre, the largest mesh is read, without animation: see `facejax.io.glb_reader`.
@@ -62,7 +66,16 @@ def read(path: str | os.PathLike) -> Mesh:
     return _checked(path, vertices, faces)
 
 
-def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.ndarray, np.ndarray | None, dict]:
+class AnimationExtra(TypedDict, total=False):
+    """Landmarks and frame rate of an animation, as far as its file has them."""
+
+    landmarks: np.ndarray  # as in the file, unchecked
+    fps: float
+
+
+def read_animation(
+    path: str | os.PathLike[str], *, bare: bool = False
+) -> tuple[np.ndarray, np.ndarray | None, AnimationExtra]:
     """Read an NPZ of `vertices` (T, N, 3) or (N, 3) and `faces`, and optional `landmarks` and `fps`.
 
     Only the first frame is checked.
@@ -85,7 +98,7 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
     if vertices.ndim not in (2, 3) or 0 in vertices.shape:
         raise MeshError(f"{path}: vertices must be (T, N, 3) or (N, 3), got {vertices.shape}")
     first = _checked(path, vertices if vertices.ndim == 2 else vertices[0], faces)
-    extra = {"landmarks": found["landmarks"]} if "landmarks" in found else {}
+    extra: AnimationExtra = {"landmarks": found["landmarks"]} if "landmarks" in found else {}
     if "fps" in found:
         if found["fps"].size != 1 or found["fps"].dtype.kind not in "fiu":
             raise MeshError(f"{path}: fps must be one number, got {found['fps'].shape} {found['fps'].dtype}")
@@ -93,7 +106,7 @@ def read_animation(path: str | os.PathLike, *, bare: bool = False) -> tuple[np.n
     return vertices, first.faces if bare or faces is None else faces.astype(np.int32), extra
 
 
-def count_frames(path: str | os.PathLike) -> int:
+def count_frames(path: str | os.PathLike[str]) -> int:
     """Return the number of frames in an NPZ of `vertices` (T, N, 3), without reading them.
 
     Raises:
@@ -105,7 +118,7 @@ def count_frames(path: str | os.PathLike) -> int:
     return shape[0]
 
 
-def write(path: str | os.PathLike, vertices, faces=None) -> None:
+def write(path: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike | None = None) -> None:
     """Write a mesh in the format of the suffix (.ply binary, .obj text, .npz), atomically and without loss.
 
     Args:
@@ -131,7 +144,9 @@ def write(path: str | os.PathLike, vertices, faces=None) -> None:
         writer(temporary, vertices, faces.astype(np.int32))
 
 
-def write_sequence(folder: str | os.PathLike, vertices, faces, *, format="ply") -> None:
+def write_sequence(
+    folder: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike | None, *, format: str = "ply"
+) -> None:
     """Write vertices (T, N, 3) as frames 000001.ply, 000002.ply, ... in a folder, which is replaced atomically.
 
     Raises:
@@ -149,7 +164,7 @@ def write_sequence(folder: str | os.PathLike, vertices, faces, *, format="ply") 
             write(temporary / f"{t + 1:06d}.{format}", frame, faces)
 
 
-def _read_obj(path: Path):
+def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if (size := path.stat().st_size) > _MAX_OBJ_BYTES:
         raise ValueError(f"{size} bytes of text; at most {_MAX_OBJ_BYTES} are read: save it as binary PLY")
     vertices, faces = array.array("d"), array.array("q")  # lists would take six times as much memory
@@ -177,7 +192,7 @@ def _read_obj(path: Path):
     return np.frombuffer(vertices, np.float64).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
 
 
-def _lines(path: Path):
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield numbered lines; one that ends in a backslash is joined with the next."""
     with path.open(encoding="utf-8", errors="replace") as stream:
         begun, number = "", 0
@@ -193,26 +208,25 @@ def _lines(path: Path):
             yield number, begun
 
 
-def _read_npz(path: Path):
+def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     found = npz.read_npz(path, ("vertices", "faces"))
-    return found.get("vertices"), found.get("faces")
+    return found["vertices"], found.get("faces")
 
 
-def _read_npy(path: Path):
+def _read_npy(path: Path) -> tuple[np.ndarray, None]:
     return npz.read_npy(path), None
 
 
-def _as_mesh_error(path: Path, reader, *options):
+def _as_mesh_error(path: Path, reader: Callable[[Path, _Wanted], _Found], wanted: _Wanted) -> _Found:
     try:
-        return reader(path, *options)
+        return reader(path, wanted)
     except FileNotFoundError:
         raise MeshError(f"{path}: no such file") from None
     except (OSError, *DAMAGE_ERRORS) as error:
         raise MeshError(f"{path}: {error}") from error
 
 
-def _checked(path: Path, vertices, faces) -> Mesh:
-    vertices = np.asarray(vertices)
+def _checked(path: Path, vertices: np.ndarray, faces: np.ndarray | None) -> Mesh:
     if vertices.dtype.kind not in "fiu":
         raise MeshError(f"{path}: vertices must be real numbers, got {vertices.dtype}")
     with np.errstate(invalid="ignore"):  # values that are not finite are rejected below
@@ -226,7 +240,6 @@ def _checked(path: Path, vertices, faces) -> Mesh:
         raise MeshError(f"{path}: vertex {bad[0]} is not finite: {vertices[bad[0]].tolist()} ({len(bad)} in all)")
     if faces is None or not np.size(faces):
         return Mesh(vertices, None)
-    faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise MeshError(f"{path}: faces must be (F, 3) integers, got {faces.shape} {faces.dtype}")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -246,5 +259,7 @@ def _write_npz(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     np.savez(path, vertices=vertices, faces=faces)
 
 
-_READERS = {".ply": ply.read, ".obj": _read_obj, ".glb": glb_reader.read, ".npz": _read_npz, ".npy": _read_npy}
+_READERS: dict[str, Callable[[Path], tuple[np.ndarray, np.ndarray | None]]] = {
+    ".ply": ply.read, ".obj": _read_obj, ".glb": glb_reader.read, ".npz": _read_npz, ".npy": _read_npy,
+}  # fmt: skip
 _WRITERS = {".ply": ply.write, ".obj": _write_obj, ".npz": _write_npz}

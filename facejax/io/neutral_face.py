@@ -9,7 +9,7 @@ from facejax.landmarks import canonical_frame
 from facejax.landmarks.canonical_frame import Face, FaceError, Topology
 
 
-def read(path: str | os.PathLike, topology: Topology) -> Face:
+def read(path: str | os.PathLike[str], topology: Topology) -> Face:
     """Read a neutral face in one of the topologies that `canonical_frame.fit` accepts.
 
     Raises:

@@ -9,6 +9,7 @@ import warnings
 import zipfile
 import zlib
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def map_npy(path: Path) -> np.ndarray:
     return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
-def skip_object_header(stream) -> None:
+def skip_object_header(stream: IO[bytes]) -> None:
     """Advance an NPY file with one object to its pickle. Raises `ValueError` for any other array."""
     shape, _, dtype = _parse_header(stream)
     if shape != () or not dtype.hasobject:
@@ -100,14 +101,14 @@ def _names(archive: zipfile.ZipFile, needed: str) -> set[str]:
     return names
 
 
-def _read(stream, size: int, name: str) -> np.ndarray:
+def _read(stream: IO[bytes], size: int, name: str) -> np.ndarray:
     """Read an NPY stream of a known size."""
     shape, fortran, dtype, need = _header(stream, size, name)
     return np.frombuffer(stream.read(need), dtype).reshape(shape, order="F" if fortran else "C")
 
 
 def _header(
-    stream, size: int, name: str, *, limit: int | None = MAX_BYTES
+    stream: IO[bytes], size: int, name: str, *, limit: int | None = MAX_BYTES
 ) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Return shape, Fortran order, dtype and bytes of the data, checked against the size of the stream."""
     if limit is not None and size > limit:
@@ -121,7 +122,7 @@ def _header(
     return shape, fortran, dtype, need
 
 
-def _parse_header(stream) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _parse_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Return shape, Fortran order and dtype."""
     version = np.lib.format.read_magic(stream)
     if version not in _HEADERS:

@@ -3,7 +3,7 @@
 Functions raise plain ValueError; `meshes.read` adds the file's name.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,7 +43,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return _elements(source, elements)
 
 
-def _elements(source, elements: list[_Element]) -> tuple[np.ndarray, np.ndarray]:
+def _elements(source: "_Binary | _Text", elements: list[_Element]) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = None, np.zeros((0, 3), np.int64)
     for element in elements:
         columns = _rows(source, element)
@@ -107,7 +107,7 @@ def _header(data: bytes) -> tuple[str, list[_Element], int]:
     return order, elements, line_end + 1
 
 
-def _rows(source, element: _Element) -> dict:
+def _rows(source: "_Binary | _Text", element: _Element) -> Mapping[str, np.ndarray | list[np.ndarray]]:
     """Return columns by name: arrays for scalars and for lists of equal length, Python lists for others."""
     if all(item.length_kind is None for item in element.properties):
         return source.table(element, {})
@@ -124,11 +124,11 @@ def _rows(source, element: _Element) -> dict:
         return columns
     if element.rows > _MAX_RAGGED_ROWS:
         raise ValueError(f"{element.rows} rows of {element.name} differ in length; at most {_MAX_RAGGED_ROWS} are read")
-    columns = {item.name: [] for item in element.properties}
+    lists: dict[str, list[np.ndarray]] = {item.name: [] for item in element.properties}
     for _ in range(element.rows):
         for name, values in source.one_row(element).items():
-            columns[name].append(values)
-    return columns
+            lists[name].append(values)
+    return lists
 
 
 class _Binary:
@@ -140,7 +140,7 @@ class _Binary:
     def copy(self) -> "_Binary":
         return _Binary(self.data, self.at, self.order)
 
-    def take(self, dtype, count: int, what: str) -> np.ndarray:
+    def take(self, dtype: np.dtype | str, count: int, what: str) -> np.ndarray:
         need = np.dtype(dtype).itemsize * count
         if self.at + need > len(self.data):
             there = len(self.data) - self.at
@@ -148,8 +148,8 @@ class _Binary:
         self.at += need
         return np.frombuffer(self.data, dtype, count, self.at - need)
 
-    def one_row(self, element: _Element) -> dict:
-        row = {}
+    def one_row(self, element: _Element) -> dict[str, np.ndarray]:
+        row: dict[str, np.ndarray] = {}
         for item in element.properties:
             length = int(self.take(self.order + item.length_kind, 1, element.name)[0]) if item.length_kind else 1
             if length < 0:
@@ -158,7 +158,7 @@ class _Binary:
             row[item.name] = values if item.length_kind else values[0]
         return row
 
-    def table(self, element: _Element, lengths: dict[str, int]) -> dict:
+    def table(self, element: _Element, lengths: dict[str, int]) -> dict[str, np.ndarray]:
         fields = []
         for item in element.properties:
             if item.length_kind:
@@ -192,8 +192,8 @@ class _Text:
         self.at += count
         return self.numbers[self.at - count : self.at]
 
-    def one_row(self, element: _Element) -> dict:
-        row = {}
+    def one_row(self, element: _Element) -> dict[str, np.ndarray]:
+        row: dict[str, np.ndarray] = {}
         for item in element.properties:
             length = self.take(1, element.name)[0] if item.length_kind else 1
             if not (0 <= length <= len(self.numbers) and length == int(length)):
@@ -202,7 +202,7 @@ class _Text:
             row[item.name] = values if item.length_kind else values[0]
         return row
 
-    def table(self, element: _Element, lengths: dict[str, int]) -> dict:
+    def table(self, element: _Element, lengths: dict[str, int]) -> dict[str, np.ndarray]:
         widths = [1 + lengths[item.name] if item.length_kind else 1 for item in element.properties]
         table = self.take(element.rows * sum(widths), element.name).reshape(element.rows, sum(widths))
         columns, at = {}, 0
@@ -226,7 +226,7 @@ def _words(data: bytes, start: int, size: int = 1 << 20) -> Iterator[list[bytes]
     yield [rest] if rest else []
 
 
-def _fans(polygons) -> np.ndarray:
+def _fans(polygons: np.ndarray | list[np.ndarray]) -> np.ndarray:
     """Return triangles (F, 3) int64 of polygons: an array (P, k), or a list of arrays."""
     groups = [polygons] if isinstance(polygons, np.ndarray) else [polygon[None] for polygon in polygons]
     if (count := sum(len(group) * (group.shape[1] - 2) for group in groups)) > MAX_ROWS:

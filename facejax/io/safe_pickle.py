@@ -13,8 +13,9 @@ import os
 import pickle
 import re
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class PickleError(errors.FileError):
     """A pickle cannot be read, or contains an object that is not allowed; the message names the file."""
 
 
-def read(path: str | os.PathLike, *, encoding: str = "latin1") -> Any:
+def read(path: str | os.PathLike[str], *, encoding: str = "latin1") -> Any:
     """Read a pickle of dicts, lists and arrays.
 
     Args:
@@ -50,7 +51,7 @@ def read(path: str | os.PathLike, *, encoding: str = "latin1") -> Any:
         raise PickleError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def load(stream, *, encoding: str = "latin1") -> Any:
+def load(stream: IO[bytes], *, encoding: str = "latin1") -> Any:
     """Read a pickle from an open file, as `read`. Raises `PickleError` without the file's name."""
     data = stream.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
@@ -66,7 +67,7 @@ def load(stream, *, encoding: str = "latin1") -> Any:
 class _Dtype:
     """A stand-in for NumPy's dtype, whose state could be set to values that crash the process."""
 
-    def __init__(self, name: str, align: Any = False, copy: Any = False):
+    def __init__(self, name: object, align: Any = False, copy: Any = False):
         if not (isinstance(name, str) and _DTYPE.fullmatch(name)):
             raise PickleError(f"contains an array with dtype {str(name)[:40]!r}, which is not allowed")
         self.name, self.order = name.lstrip("<>|="), "="
@@ -158,7 +159,7 @@ def _encode(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-_ALLOWED = {
+_ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _encode,
@@ -169,10 +170,13 @@ for _core in ("numpy.core", "numpy._core"):
     _ALLOWED[f"{_core}.multiarray", "scalar"] = _scalar
 
 
-class _Unpickler(pickle._Unpickler):
+_PurePython = pickle._Unpickler  # pyright: ignore[reportPrivateUsage] (it has no public name)
+
+
+class _Unpickler(_PurePython):
     """Python's unpickler in Python: the C version allocates memory for any memo index that a pickle contains."""
 
-    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+    dispatch: ClassVar[dict[int, Any]] = dict(_PurePython.dispatch)
     stack: list[Any]
 
     def load_bytearray8(self) -> None:

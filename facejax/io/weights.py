@@ -22,8 +22,7 @@ from facejax.io import atomic, errors
 
 Tree = Any
 _HEADER = "facejax"
-_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(ml_dtypes.bfloat16)}
-_DTYPES |= {
+_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(ml_dtypes.bfloat16)} | {
     f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}")
     for kind in "fiu"
     for size in (1, 2, 4, 8)
@@ -52,7 +51,7 @@ def names(tree: Tree) -> dict[str, Any]:
     return leaves
 
 
-def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
+def save(path: str | os.PathLike[str], tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
     """Write a tree of arrays and JSON-serialisable `metadata` to a file, atomically."""
     path = Path(path)
     arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
@@ -62,7 +61,7 @@ def save(path: str | os.PathLike, tree: Tree, *, metadata: dict[str, Any] | None
         temporary.write_bytes(data)
 
 
-def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
+def load(path: str | os.PathLike[str], like: Tree) -> tuple[Tree, dict[str, Any]]:
     """Read a tree of NumPy arrays, and the metadata.
 
     Args:
@@ -84,7 +83,7 @@ def load(path: str | os.PathLike, like: Tree) -> tuple[Tree, dict[str, Any]]:
     return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in expected]), metadata
 
 
-def load_metadata(path: str | os.PathLike) -> dict[str, Any]:
+def load_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read only the metadata, such as the configuration from which to build `like`."""
     with _open(path) as file:
         return _metadata(path, file)
@@ -107,7 +106,7 @@ def _describe(leaf: Any) -> str:
     return f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
 
 
-def _shape_and_dtype(file, name: str) -> Any:
+def _shape_and_dtype(file: safe_open, name: str) -> Any:
     """Return the shape and dtype of a tensor in the header; an unsupported dtype becomes void."""
     import jax
 
@@ -115,7 +114,7 @@ def _shape_and_dtype(file, name: str) -> Any:
     return jax.ShapeDtypeStruct(tuple(part.get_shape()), _DTYPES.get(part.get_dtype(), np.dtype("V1")))
 
 
-def _open(path: str | os.PathLike):
+def _open(path: str | os.PathLike[str]) -> safe_open:
     try:
         return safe_open(path, framework="np")
     except FileNotFoundError:
@@ -126,7 +125,7 @@ def _open(path: str | os.PathLike):
         ) from error
 
 
-def _metadata(path: str | os.PathLike, file) -> dict[str, Any]:
+def _metadata(path: str | os.PathLike[str], file: safe_open) -> dict[str, Any]:
     try:
         return json.loads((file.metadata() or {})[_HEADER])
     except (KeyError, json.JSONDecodeError):

@@ -12,6 +12,7 @@ from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Float64, Integer, Real
 
 from facejax.geometry import align
 
@@ -30,16 +31,16 @@ class FaceError(ValueError):
 class Topology(NamedTuple):
     """The template that a face is compared with."""
 
-    vertices: np.ndarray  # (N, 3) the template at rest, mm
-    landmark_index: np.ndarray  # (L,) vertices
-    source_index: np.ndarray  # (N,) vertices of MakeHuman's body, or empty
+    vertices: Real[np.ndarray, "N 3"]  # the template at rest, mm
+    landmark_index: Integer[np.ndarray, " L"]  # vertices
+    source_index: Integer[np.ndarray, " N"]  # vertices of MakeHuman's body, or empty
 
 
 class Face(NamedTuple):
-    """vertices: (N, 3) float32 mm. notes: what was assumed, one line each."""
+    """A face in the canonical frame."""
 
-    vertices: np.ndarray
-    notes: tuple[str, ...]
+    vertices: Float32[np.ndarray, "N 3"]  # mm
+    notes: tuple[str, ...]  # what was assumed, one line each
 
 
 def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> Face:
@@ -72,7 +73,9 @@ def fit(vertices: np.ndarray, topology: Topology, *, name: str = "the face") -> 
     return Face((vertices @ turn.T * millimetres).astype(np.float32), tuple(notes))
 
 
-def align_to_template(points: np.ndarray, template: np.ndarray) -> tuple[np.ndarray, float]:
+def align_to_template(
+    points: Real[np.ndarray, "C 3"], template: Real[np.ndarray, "C 3"]
+) -> tuple[Float64[np.ndarray, "3 3"], float]:
     """Return the rotation (3, 3) from the template's landmarks (C, 3) to the points (C, 3), and their relative size.
 
     Raises:
@@ -91,7 +94,7 @@ def align_to_template(points: np.ndarray, template: np.ndarray) -> tuple[np.ndar
     return np.asarray(fit.rotation, np.float64), size / template_size
 
 
-def template68() -> np.ndarray:
+def template68() -> Float64[np.ndarray, "68 3"]:
     """Return the 68 landmarks (68, 3) float64 of MakeHuman's average face at rest, in mm."""
     with resources.files("facejax.assets").joinpath("face68.npy").open("rb") as stream:
         return np.load(stream, allow_pickle=False).astype(np.float64)
@@ -122,9 +125,9 @@ def infer_head_unit(size: float, name: str) -> tuple[float, str]:
     raise FaceError(f"{name}: size {size:.3g}; expected a head of {low:g} to {high:g} mm, in {', '.join(UNITS)}")
 
 
-def axis_rotations() -> list[np.ndarray]:
+def axis_rotations() -> list[Float64[np.ndarray, "3 3"]]:
     """Return the 24 rotations (3, 3) that permute the axes."""
-    rotations = []
+    rotations: list[np.ndarray] = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             rotation = np.zeros((3, 3))
@@ -134,14 +137,14 @@ def axis_rotations() -> list[np.ndarray]:
     return rotations
 
 
-def axes_note(turn: np.ndarray) -> list[str]:
+def axes_note(turn: Real[np.ndarray, "3 3"]) -> list[str]:
     """Return a note on an axis rotation; no note for the identity."""
     if np.array_equal(turn, np.eye(3)):
         return []
     return [f"turned so that y is up and z forward (new axes: {', '.join(_axis_name(row) for row in turn)})"]
 
 
-def centred_norm(points: np.ndarray) -> float:
+def centred_norm(points: Real[np.ndarray, "K 3"]) -> float:
     """Return the norm of points (K, 3) about their centroid."""
     return float(np.linalg.norm(points - points.mean(axis=0)))
 

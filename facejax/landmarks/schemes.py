@@ -24,9 +24,11 @@ jaw at different intervals and share the chin only. L landmarks, C shared ones.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int32
 
 GROUPS = ("jaw", "brows", "nose", "eyes", "lips")
 # Brows are numbered from the nose, jaw and contour from the chin, lips from the middle.
@@ -120,19 +122,19 @@ class Scheme(NamedTuple):
 
     name: str
     points: tuple[str, ...]  # (L,) anatomical names, no two alike
-    groups: dict[str, np.ndarray]  # each of `GROUPS` -> (n,) int32; empty where a scheme has none
-    mirror: np.ndarray  # (L,) int32: index of the mirrored point; a point of the middle is its own
-    stable: np.ndarray  # (n,) int32: points that hardly move relative to the skull
+    groups: dict[str, Int32[np.ndarray, " n"]]  # of each of `GROUPS`; empty where a scheme has none
+    mirror: Int32[np.ndarray, " L"]  # index of the mirrored point; a point of the middle is its own
+    stable: Int32[np.ndarray, " n"]  # points that hardly move relative to the skull
 
 
 def by_count(count: int) -> Scheme:
-    """Return the scheme of so many landmarks. Raises `ValueError` for an unsupported number."""
+    """Return the scheme with `count` landmarks. Raises `ValueError` for an unsupported number."""
     if count not in _SCHEMES:
         raise ValueError(f"unsupported number of landmarks: {count} (supported: {', '.join(map(str, _SCHEMES))})")
     return _build(count)
 
 
-def common(source: int, target: int) -> tuple[np.ndarray, np.ndarray]:
+def common(source: int, target: int) -> tuple[Int32[np.ndarray, " C"], Int32[np.ndarray, " C"]]:
     """Return indices (C,) into the schemes of `source` and of `target` landmarks, of the points that they share.
 
     In the order of the source. 68 and 51 share 51; 68 and 83 share 47; 51 and 83 share 46; 66 shares 49 with 51 and 45
@@ -163,7 +165,7 @@ def _build(count: int) -> Scheme:
     return Scheme(name, points, groups, mirror, _index(i for i, point in enumerate(points) if point in _STABLE))
 
 
-def _index(values) -> np.ndarray:
+def _index(values: Iterable[int]) -> np.ndarray:
     # Cached and shared between callers: read-only.
     index = np.fromiter(values, np.int32)
     index.flags.writeable = False

@@ -15,7 +15,7 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from facejax.mesh import graph
 from facejax.mesh.normals import vertex_normals_host
@@ -27,7 +27,7 @@ PAIRS = 1 << 20  # of points and triangles, about, that are compared at once
 class Group(NamedTuple):
     """Triangles of similar size."""
 
-    tree: cKDTree  # of centroids
+    tree: KDTree  # of centroids
     triangles: np.ndarray  # (G,) indices into the faces
     radius: float  # the largest distance of a corner from its triangle's centroid
 
@@ -42,7 +42,7 @@ class Surface(NamedTuple):
     centroids: np.ndarray  # (F, 3)
     radii: np.ndarray  # (F,)
     planes: np.ndarray  # (F, 3) unit normals of the triangles, 0 for one without area
-    tree: cKDTree  # of all centroids
+    tree: KDTree  # of all centroids
     groups: tuple[Group, ...]  # from the largest triangles to the smallest
 
 
@@ -69,10 +69,10 @@ def surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
     groups = []
     for value in np.unique(size)[::-1]:
         members = np.flatnonzero(size == value)
-        groups.append(Group(cKDTree(centroids[members]), members, float(radii[members].max())))
+        groups.append(Group(KDTree(centroids[members]), members, float(radii[members].max())))
     planes = doubled / np.maximum(area, 1e-30)[:, None]
     normals, edge = vertex_normals_host(vertices, faces), graph.on_boundary(faces, len(vertices))
-    return Surface(vertices, faces, normals, edge, centroids, radii, planes, cKDTree(centroids), tuple(groups))
+    return Surface(vertices, faces, normals, edge, centroids, radii, planes, KDTree(centroids), tuple(groups))
 
 
 def closest_points(

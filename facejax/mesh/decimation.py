@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import fast_simplification
 import numpy as np
+from jaxtyping import Float32, Int32, Integer, Real
 
 from facejax.mesh import closest_point, graph
 
 
-def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def decimate(
+    vertices: Real[np.ndarray, "N 3"], faces: Integer[np.ndarray, "F 3"], factor: float
+) -> tuple[Int32[np.ndarray, " M"], Int32[np.ndarray, "G 3"], Int32[np.ndarray, " N"]]:
     """Decimate a mesh of N vertices to about N / factor.
 
     Returns:
@@ -28,9 +31,8 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np
     # not depend on the unit.
     pairs = graph.edges(faces)
     scaled = vertices / np.mean(np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1))
-    _, _, collapses = fast_simplification.simplify(
-        scaled, faces, target_reduction=1 - 1 / factor, return_collapses=True
-    )
+    reduction = 1 - 1 / factor
+    collapses = fast_simplification.simplify(scaled, faces, target_reduction=reduction, return_collapses=True)[-1]
     points, coarse, group = fast_simplification.replay_simplification(scaled, faces, collapses)
     if len(coarse) == 0 or len(points) > 0.9 * len(vertices):
         raise ValueError(
@@ -48,7 +50,9 @@ def decimate(vertices: np.ndarray, faces: np.ndarray, factor: float) -> tuple[np
     return kept.astype(np.int32), rank[coarse].astype(np.int32), rank[group].astype(np.int32)
 
 
-def upsampling(vertices: np.ndarray, coarse: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def upsampling(
+    vertices: Real[np.ndarray, "N 3"], coarse: Real[np.ndarray, "M 3"], faces: Integer[np.ndarray, "G 3"]
+) -> tuple[Int32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
     """Return corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest points on a coarse mesh.
 
     Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some order. The search

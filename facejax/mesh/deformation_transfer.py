@@ -12,6 +12,7 @@ Fields are (B, N, 3) on N vertices, in the unit of the vertices; F triangles. Wo
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float, Float64, Integer, Real
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -19,7 +20,9 @@ ANCHOR = 1e-4  # weight of a vertex that never moves
 MOTION = 0.05  # mm, root mean square: vertices that move more than this are anchored less
 
 
-def gradient_operator(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.csr_matrix, np.ndarray]:
+def gradient_operator(
+    vertices: Real[np.ndarray, "N 3"], faces: Integer[np.ndarray, "F 3"]
+) -> tuple[sparse.csr_matrix, Float[np.ndarray, " F"]]:
     """Return the operator from vertex values (N,) to gradients per triangle (3F,), and the areas (F,).
 
     Raises `ValueError` for a triangle without area, on which no gradient is defined.
@@ -40,7 +43,7 @@ def gradient_operator(vertices: np.ndarray, faces: np.ndarray) -> tuple[sparse.c
     return sum(parts[1:], parts[0]), double[:, 0] / 2
 
 
-def anchor_weights(motion: np.ndarray) -> np.ndarray:
+def anchor_weights(motion: Real[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
     """Return anchor weights (N,) from how far vertices usually move (N,), root mean square in mm."""
     return ANCHOR / (1 + (np.asarray(motion) / MOTION) ** 2)
 
@@ -48,7 +51,13 @@ def anchor_weights(motion: np.ndarray) -> np.ndarray:
 class DeformationTransfer:
     """Transfer from one face to another: factorised once per pair of faces, then called with fields."""
 
-    def __init__(self, source: np.ndarray, target: np.ndarray, faces: np.ndarray, anchors: np.ndarray):
+    def __init__(
+        self,
+        source: Real[np.ndarray, "N 3"],
+        target: Real[np.ndarray, "N 3"],
+        faces: Integer[np.ndarray, "F 3"],
+        anchors: Real[np.ndarray, " N"],
+    ):
         """Factorise the system of `source` and `target` (N, 3) with `anchors` (N,), weights per mean triangle area.
 
         Raises `ValueError` for faces of different shapes, and for a triangle without area.
@@ -66,7 +75,7 @@ class DeformationTransfer:
         normal = self._target_gradient.T @ self._areas @ self._target_gradient
         self._solve = splu((normal + self._anchors).tocsc()).solve
 
-    def __call__(self, fields: np.ndarray) -> np.ndarray:
+    def __call__(self, fields: Real[np.ndarray, "B N 3"]) -> Float64[np.ndarray, "B N 3"]:
         """Return the source's fields (B, N, 3) transferred to the target."""
         batch, count, _ = fields.shape
         flat = np.moveaxis(np.asarray(fields, np.float64), 1, 0).reshape(count, -1)
@@ -76,8 +85,8 @@ class DeformationTransfer:
 
 
 def invert(
-    transfer: DeformationTransfer, inverse: DeformationTransfer, fields: np.ndarray, *, rounds: int = 2
-) -> np.ndarray:
+    transfer: DeformationTransfer, inverse: DeformationTransfer, fields: Real[np.ndarray, "B N 3"], *, rounds: int = 2
+) -> Float64[np.ndarray, "B N 3"]:
     """Return the fields at the target of `transfer` that `inverse` takes to the given ones (B, N, 3).
 
     A transfer there and back does not return the same field, since triangles of two faces lie in different planes. Each

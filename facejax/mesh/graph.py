@@ -5,13 +5,16 @@ N vertices, F triangles. A triangle's corners run counter-clockwise seen from ou
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from jaxtyping import Bool, Float64, Int32, Integer, Real
 from scipy.sparse import csgraph, csr_array
 
 WELD = 1e-7  # of the mesh's size: vertices nearer to one another are merged
 
 
-def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[Float64[np.ndarray, "N 3"], Int32[np.ndarray, "F 3"]]:
     """Check a mesh and return copies of its vertices (N, 3) float64 and faces (F, 3) int32.
 
     Raises `ValueError` for wrong shapes, face indices out of range, and vertices that no triangle uses.
@@ -31,12 +34,14 @@ def check(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return vertices, faces.astype(np.int32)
 
 
-def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def weld(
+    vertices: Real[np.ndarray, "N 3"], faces: Integer[np.ndarray, "F 3"]
+) -> tuple[Integer[np.ndarray, " W"], Integer[np.ndarray, " N"], Integer[np.ndarray, "G 3"]]:
     """Merge vertices at the same position, which exporters duplicate along texture seams.
 
     Returns:
       the kept vertices (W,), the index (N,) of each vertex among them, -1 where no triangle uses it, and triangles
-      (F', 3) over the kept ones, without those that have become degenerate.
+      (G, 3) over the kept ones, without those that have become degenerate.
     """
     size = np.ptp(vertices, axis=0).max()
     used, places = np.unique(faces, return_inverse=True)
@@ -49,19 +54,19 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return used[first], where, joined[whole]
 
 
-def edges(faces: np.ndarray) -> np.ndarray:
+def edges(faces: Integer[np.ndarray, "F 3"]) -> Integer[np.ndarray, "E 2"]:
     """Return the undirected edges (E, 2), smaller index first, each once, sorted."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(pairs, axis=0)
 
 
-def rings(faces: np.ndarray, count: int) -> list[list[int]]:
+def rings(faces: Integer[np.ndarray, "F 3"], count: int) -> list[list[int]]:
     """Return the neighbours of each of `count` vertices in counter-clockwise order, as a cycle.
 
     A boundary vertex's open fan starts at its clockwise end, so that the cycle jumps across the boundary and continues
     from the other side. Several fans at one vertex follow one another.
     """
-    following = [{} for _ in range(count)]
+    following: list[dict[int, int | None]] = [{} for _ in range(count)]
     for a, b, c in faces.tolist():
         for corner, first, second in ((a, b, c), (b, c, a), (c, a, b)):
             turns = following[corner]
@@ -74,7 +79,7 @@ def rings(faces: np.ndarray, count: int) -> list[list[int]]:
 def _chain(following: dict[int, int | None]) -> list[int]:
     """Return all keys of {neighbour: next one}, run by run; a closed run starts at its smallest key."""
     starts = sorted(following.keys() - set(following.values())) + sorted(following)
-    ordered = {}
+    ordered: dict[int, bool] = {}
     for vertex in starts:
         while vertex is not None and vertex not in ordered:
             ordered[vertex] = True
@@ -82,7 +87,11 @@ def _chain(following: dict[int, int | None]) -> list[int]:
     return list(ordered)
 
 
-def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def paths(
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    sources: Sequence[int] | Integer[np.ndarray, " K"],
+) -> tuple[Float64[np.ndarray, " N"], Integer[np.ndarray, " N"]]:
     """Return the shortest paths along edges from the nearest source: distances (N,) and predecessors (N,).
 
     Unreachable vertices have distance inf; they and the sources have predecessor -1.
@@ -98,19 +107,23 @@ def paths(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> tuple
     return distance, np.maximum(predecessor, -1)
 
 
-def geodesic(vertices: np.ndarray, faces: np.ndarray, sources: np.ndarray) -> np.ndarray:
+def geodesic(
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    sources: Sequence[int] | Integer[np.ndarray, " K"],
+) -> Float64[np.ndarray, " N"]:
     """Return the distance (N,) along edges to the nearest source vertex, in the vertices' unit; inf if unreachable."""
     return paths(np.asarray(vertices, np.float64), faces, sources)[0]
 
 
-def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
+def boundary_loops(faces: Integer[np.ndarray, "F 3"]) -> list[Integer[np.ndarray, " _"]]:
     """Return the closed loops of the boundary, each as its vertices in the orientation of its triangles."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ahead, back = (
         np.ravel_multi_index(edge.T, (np.max(faces, initial=0) + 1,) * 2) for edge in (directed, directed[:, ::-1])
     )
     follows = dict(directed[~np.isin(ahead, back)].tolist())
-    loops = []
+    loops: list[np.ndarray] = []
     while follows:
         loop = [next(iter(follows))]
         after = follows.pop(loop[0])
@@ -122,7 +135,7 @@ def boundary_loops(faces: np.ndarray) -> list[np.ndarray]:
     return loops
 
 
-def on_boundary(faces: np.ndarray, count: int) -> np.ndarray:
+def on_boundary(faces: Integer[np.ndarray, "F 3"], count: int) -> Bool[np.ndarray, " {count}"]:
     """Return which of `count` vertices lie on a boundary edge, one of a single triangle: (count,) bool."""
     pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1).astype(np.int64)
     found, times = np.unique(pairs[:, 0] * count + pairs[:, 1], return_counts=True)

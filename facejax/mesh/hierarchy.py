@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
+from facejax.io import atomic
 from facejax.mesh import decimation, graph, spirals, stencils
 from facejax.mesh.stencils import Stencil
 
@@ -25,17 +26,18 @@ FORMAT = 1  # increase it when the same template and options give different tabl
 FACTORS = (4.0, 4.0, 4.0, 4.0)
 # Fine to coarse, as in the published sparse-to-dense decoder (Otberdout et al. 2023).
 LENGTHS = (15, 14, 9, 9)
+Tables = tuple[np.ndarray, ...]  # one per level
 _STORED = ("kept", "faces", "spirals", "corners", "weights")
 
 
 class Hierarchy(NamedTuple):
     """Levels 0..n of a template with N_0 = N vertices; every tuple runs from fine to coarse."""
 
-    kept: tuple[np.ndarray, ...]  # n + 1 of (N_i,) int32: the level's vertices, as indices into the template
-    faces: tuple[np.ndarray, ...]  # n + 1 of (F_i, 3) int32
-    spirals: tuple[np.ndarray, ...]  # n of (N_i, S_i) int32; N_i marks the dummy vertex, which reads zero
-    corners: tuple[np.ndarray, ...]  # n of (N_i, 3) int32: the vertices of level i + 1 under each vertex
-    weights: tuple[np.ndarray, ...]  # n of (N_i, 3) float32: their barycentric weights, >= 0, sum 1
+    kept: Tables  # n + 1 of (N_i,) int32: the level's vertices, as indices into the template
+    faces: Tables  # n + 1 of (F_i, 3) int32
+    spirals: Tables  # n of (N_i, S_i) int32; N_i marks the dummy vertex, which reads zero
+    corners: Tables  # n of (N_i, 3) int32: the vertices of level i + 1 under each vertex
+    weights: Tables  # n of (N_i, 3) float32: their barycentric weights, >= 0, sum 1
     # Derived from the tables above, for `spiral_conv`:
     climbs: tuple[Stencil, ...]  # n: the spirals of level i on a signal of level i + 1
     surface: Stencil  # the spirals of level 0 on a signal of level 0
@@ -94,7 +96,7 @@ def build(
     return hierarchy
 
 
-def save(hierarchy: Hierarchy) -> dict[str, np.ndarray]:
+def save(hierarchy: Hierarchy) -> dict[str, np.ndarray | jax.Array]:
     """Return the tables by name (`spirals/0`), for any file of named arrays; `load` derives the stencils."""
     return {f"{field}/{i}": table for field in _STORED for i, table in enumerate(getattr(hierarchy, field))}
 
@@ -120,14 +122,18 @@ def load(arrays: Mapping[str, np.ndarray]) -> Hierarchy:
     return _complete(kept, faces, tables, corners, weights)
 
 
-def _build(vertices, faces, factors, lengths, reference, dilation) -> Hierarchy:
-    kept, triangles, tables, corners, weights = (
-        [np.arange(len(vertices), dtype=np.int32)],
-        [faces],
-        [],
-        [],
-        [],
-    )
+def _build(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    factors: Sequence[float],
+    lengths: Sequence[int | None],
+    reference: int,
+    dilation: int,
+) -> Hierarchy:
+    kept, triangles = [np.arange(len(vertices), dtype=np.int32)], [faces]
+    tables: list[np.ndarray] = []
+    corners: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
     origin = vertices[reference]
     for factor, length in zip(factors, lengths, strict=True):
         nearest = int(np.argmin(np.linalg.norm(vertices - origin, axis=1)))
@@ -139,12 +145,12 @@ def _build(vertices, faces, factors, lengths, reference, dilation) -> Hierarchy:
         vertices, faces = vertices[chosen], coarse
         kept.append(kept[-1][chosen])
         triangles.append(faces)
-    return _complete(*map(tuple, (kept, triangles, tables, corners, weights)))
+    return _complete(tuple(kept), tuple(triangles), tuple(tables), tuple(corners), tuple(weights))
 
 
-def _complete(kept, faces, tables, corners, weights) -> Hierarchy:
+def _complete(kept: Tables, faces: Tables, tables: Tables, corners: Tables, weights: Tables) -> Hierarchy:
     levels = zip(tables, corners, weights, kept[1:], strict=True)
-    climbs = tuple(stencils.build(*level, len(coarse)) for *level, coarse in levels)
+    climbs = tuple(stencils.build(table, corner, weight, len(coarse)) for table, corner, weight, coarse in levels)
     return Hierarchy(kept, faces, tables, corners, weights, climbs, stencils.flat(tables[0]))
 
 
@@ -159,14 +165,5 @@ def _read(path: Path) -> Hierarchy | None:
 
 
 def _write(path: Path, hierarchy: Hierarchy) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # In the same folder, because a rename is atomic only within one file system.
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=".npz")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **save(hierarchy))
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with atomic.replace_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **save(hierarchy))  # pyright: ignore[reportArgumentType]  the stub takes names for allow_pickle

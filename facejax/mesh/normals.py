@@ -14,15 +14,15 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Integer
 
-from facejax.geometry.sphere import safe_sqrt
+from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 SHORTEST = 1e-20  # a sum of normals times double areas that is no longer has no direction, in the unit squared
 
 
 @jax.jit
 def vertex_normals(
-    vertices: Float[Array | np.ndarray, "*batch N 3"], faces: Integer[Array | np.ndarray, "F 3"]
-) -> Float[Array, "*batch N 3"]:
+    vertices: Float[AnyArray, "*lead N 3"], faces: Integer[AnyArray, "F 3"]
+) -> Float[Array, "*lead N 3"]:
     """Return the unit normals (..., N, 3) of vertices (..., N, 3) with triangles (F, 3).
 
     A normal is 0 where the adjacent triangles have no area, where their normals cancel to rounding, and at a vertex
@@ -40,8 +40,8 @@ def vertex_normals(
 
 
 def vertex_normals_host(
-    vertices: Float[np.ndarray, "*batch N 3"], faces: Integer[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "*batch N 3"]:
+    vertices: Float[np.ndarray, "*lead N 3"], faces: Integer[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "*lead N 3"]:
     """Return the unit normals (..., N, 3) of vertices (..., N, 3), float32 or float64, in their dtype; see the module.
 
     Edges are computed in the dtype of the vertices, products and sums in float64. A normal is 0 where the sum of the
@@ -60,8 +60,8 @@ def vertex_normals_host(
 
 
 def triangle_normals(
-    first: Float[Array | np.ndarray, "*batch 3"], second: Float[Array | np.ndarray, "*batch 3"]
-) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 1"]]:
+    first: Float[AnyArray, "*lead 3"], second: Float[AnyArray, "*lead 3"]
+) -> tuple[Float[Array, "*lead 3"], Float[Array, "*lead 1"]]:
     """Return unit normals (..., 3) and double areas (..., 1) of triangles with edges (..., 3) from one corner.
 
     Both are 0 where the area is below the rounding error of a product of two edges: in float32, for a triangle ten
@@ -75,8 +75,8 @@ def triangle_normals(
 
 
 def unit_or_zero(
-    vectors: Float[Array, "*batch 3"], size: Float[Array, "*batch 1"], least: ArrayLike
-) -> Float[Array, "*batch 3"]:
+    vectors: Float[Array, "*lead 3"], size: Float[Array, "*lead 1"], least: ArrayLike
+) -> Float[Array, "*lead 3"]:
     """Return vectors (..., 3) divided by their `norm`, `size` (..., 1); 0 where the size is at most `least`."""
     limits = jnp.finfo(vectors.dtype)
     # The squares of shorter vectors are denormal numbers, which have lost digits.
@@ -84,7 +84,7 @@ def unit_or_zero(
     return jnp.where(kept, vectors / jnp.where(kept, size, 1), 0)
 
 
-def norm(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 1"]:
+def norm(vectors: Float[Array, "*lead 3"]) -> Float[Array, "*lead 1"]:
     """Return the norm (..., 1) of vectors (..., 3), with gradient 0 at 0."""
     return safe_sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
 

@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float32, Integer, Real
+from scipy.spatial import KDTree
 
 from facejax.geometry import rbf
 from facejax.geometry.interpolation import smoothstep
@@ -35,11 +36,11 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
     that vertex to its sixth neighbour.
     """
     landmarks, vertices = _points(landmarks, "landmarks"), _points(vertices, "vertices")
-    tree = cKDTree(vertices)
-    distance, nearest = tree.query(landmarks)
-    ring = tree.query(vertices[nearest], k=[min(7, len(vertices))])[0][:, 0]
+    tree = KDTree(vertices)
+    distance, nearest = (np.asarray(found) for found in tree.query(landmarks))
+    ring = tree.query(vertices[nearest], k=min(7, len(vertices)))[0].reshape(len(nearest), -1)[:, -1]
     spread = np.sqrt(np.mean(np.sum((landmarks - landmarks.mean(axis=0)) ** 2, axis=1)))
-    pairs = cKDTree(landmarks).query_pairs(rbf.COINCIDENT * spread)
+    pairs = KDTree(landmarks).query_pairs(rbf.COINCIDENT * spread)
     if pairs:
         a, b = min(pairs)
         raise ValueError(f"landmarks {a} and {b} coincide at {landmarks[a]}: move one of them")
@@ -53,8 +54,12 @@ def check(landmarks: np.ndarray, vertices: np.ndarray) -> None:
 
 
 def distant_boundary(
-    vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH
-) -> np.ndarray:
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    landmarks: Real[np.ndarray, "L 3"],
+    *,
+    reach: float = REACH,
+) -> Integer[np.ndarray, " P"]:
     """Return the boundary vertices (P,) that are farther than `reach` spacings from every landmark (L, 3).
 
     On a head, the edge of the neck; on a cropped face, the parts of its edge without landmarks. The edges of mouth and
@@ -64,12 +69,18 @@ def distant_boundary(
     if len(landmarks) < 2:
         raise ValueError(f"landmarks: expected at least 2, got {len(landmarks)}")
     edge = np.sort(np.concatenate([np.zeros(0, np.int64), *graph.boundary_loops(faces)]))
-    tree = cKDTree(landmarks)
+    tree = KDTree(landmarks)
     spacing = tree.query(landmarks, k=2)[0][:, 1].mean()
     return edge[tree.query(vertices[edge])[0] > reach * spacing]
 
 
-def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, reach: float = REACH) -> np.ndarray:
+def falloff(
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    landmarks: Real[np.ndarray, "L 3"],
+    *,
+    reach: float = REACH,
+) -> Float32[np.ndarray, " N"]:
     """Return factors (N,) float32 in [0, 1] for the rows of `geometry.rbf.weights`, falling with distance to landmarks.
 
     1 at a landmark (L, 3); 0 where the nearest landmark is as far as from the nearest vertex of the
@@ -81,13 +92,16 @@ def falloff(vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, *, r
     pinned = distant_boundary(vertices, faces, landmarks, reach=reach)
     if len(pinned) == 0:
         return np.ones(len(vertices), np.float32)
-    distance = cKDTree(landmarks).query(vertices)[0]
+    distance = KDTree(landmarks).query(vertices)[0]
     return (1 - smoothstep(distance, 0, distance[pinned].min())).astype(np.float32)
 
 
 def upper_lip_share(
-    vertices: np.ndarray, faces: np.ndarray, landmarks: np.ndarray, lips: tuple[Sequence[int], Sequence[int]]
-) -> np.ndarray:
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    landmarks: Real[np.ndarray, "L 3"],
+    lips: tuple[Sequence[int], Sequence[int]],
+) -> Float32[np.ndarray, " N"]:
     """Return the upper lip's share (N,) in [0, 1] of each vertex: 1 above, 0 below, in between at the corners.
 
     lips: the landmarks (of L, 3) of the upper and of the lower lip. With a and b the geodesic distances to the nearest
@@ -104,12 +118,12 @@ def upper_lip_share(
 
 
 def split_lips(
-    vertices: np.ndarray,
-    landmarks: np.ndarray,
+    vertices: Real[np.ndarray, "N 3"],
+    landmarks: Real[np.ndarray, "L 3"],
     lips: tuple[Sequence[int], Sequence[int]],
-    share: np.ndarray,
+    share: Real[np.ndarray, " N"],
     **options: Any,
-) -> np.ndarray:
+) -> Float32[np.ndarray, "N L"]:
     """Return weights (N, L) float32 blended from two fits, one without the lower and one without the upper lip.
 
     `share` (N,), from `upper_lip_share`, is the weight of the first fit at each vertex. Landmarks are interpolated and
@@ -123,14 +137,14 @@ def split_lips(
 
 
 def weights(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    landmarks: np.ndarray,
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    landmarks: Real[np.ndarray, "L 3"],
     *,
     lips: tuple[Sequence[int], Sequence[int]] | None = None,
     reach: float = REACH,
     **options: Any,
-) -> np.ndarray:
+) -> Float32[np.ndarray, "N L"]:
     """Return weights (N, L) float32 for `geometry.rbf.warp` of a face at rest, with falloff and separate lips.
 
     lips: the landmarks of the upper and of the lower lip, `IBUG_LIPS` with 68; without them one fit serves the whole
@@ -146,8 +160,12 @@ def weights(
 
 
 def face_region(
-    vertices: np.ndarray, faces: np.ndarray, landmark_index: np.ndarray, *, within: float = 25.0
-) -> np.ndarray:
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
+    landmark_index: Integer[np.ndarray, " L"],
+    *,
+    within: float = 25.0,
+) -> Bool[np.ndarray, " N"]:
     """Return the face region of a head: a mask (N,) of vertices with geodesic distance to a landmark <= `within` mm."""
     return graph.geodesic(vertices, faces, landmark_index) <= within
 

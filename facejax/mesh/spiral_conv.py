@@ -16,11 +16,17 @@ dominate (H200: 0.76 / 2.1 ms), and all positions at once are faster (0.43 / 0.8
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
 
+from facejax.geometry.sphere import AnyArray
 from facejax.mesh.stencils import Stencil
 
 # With few output channels the products of all positions are one matrix product, with the batch as the
@@ -36,7 +42,9 @@ _FEW_LISTS = 8
 
 
 @jax.jit
-def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
+def spiral_conv(
+    x: Float[AnyArray, "M B C"], kernel: Float[AnyArray, "S C O"], stencil: Stencil
+) -> Float[Array, "V B O"]:
     """Return the spiral convolution (V, B, O) of x (M, B, C) with kernel (S, C, O).
 
     out[v] = sum_s (upsampled x)[spiral[v, s]] @ kernel[s], where the stencil combines upsampling from a coarse mesh
@@ -58,14 +66,16 @@ def spiral_conv(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
 
 
 @jax.jit
-def spiral_conv_by_position(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
+def spiral_conv_by_position(
+    x: Float[AnyArray, "M B C"], kernel: Float[AnyArray, "S C O"], stencil: Stencil
+) -> Float[Array, "V B O"]:
     """Compute `spiral_conv` one position after another, so that the gathered array stays in a CPU's cache.
 
     Memory for M * B * O numbers. `spiral_conv` takes this form on a CPU, except for small inputs.
     """
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
-    rows = x.reshape(count * batch, channels)
+    rows = jnp.reshape(x, (count * batch, channels))
     if out_channels < _FEW_CHANNELS <= batch:
         flat_kernel = kernel.transpose(0, 2, 1).reshape(positions * out_channels, channels)
         planes = jax.lax.dot_general(flat_kernel, rows, (((1,), (1,)), ((), ())))
@@ -73,13 +83,15 @@ def spiral_conv_by_position(x: jax.Array, kernel: jax.Array, stencil: Stencil) -
         summed = _sum_positions(lambda plane: plane, planes, stencil, axis=1)
         return jnp.transpose(summed, (1, 2, 0))
     summed = _sum_positions(
-        lambda weight: (rows @ weight).reshape(count, batch * out_channels), kernel, stencil, axis=0
+        lambda weight: (rows @ weight).reshape(count, batch * out_channels), jnp.asarray(kernel), stencil, axis=0
     )
     return summed.reshape(stencil.source.shape[2], batch, out_channels)
 
 
 @jax.jit
-def spiral_conv_at_once(x: jax.Array, kernel: jax.Array, stencil: Stencil) -> jax.Array:
+def spiral_conv_at_once(
+    x: Float[AnyArray, "M B C"], kernel: Float[AnyArray, "S C O"], stencil: Stencil
+) -> Float[Array, "V B O"]:
     """Compute `spiral_conv` as one product and one gathered sum over all positions: few large kernels for a GPU.
 
     Memory for S * M * B * O numbers. `spiral_conv` takes this form on accelerators, and on a CPU for small inputs.
@@ -100,19 +112,27 @@ def _joined(stencil: Stencil) -> Stencil:
     return Stencil(
         (stencil.source * positions + position[:, None]).reshape(-1, vertices),
         stencil.weight.reshape(-1, vertices),
-        *(table.transpose(1, 2, 0).reshape(table.shape[1], -1) for table in (stencil.back, stencil.back_weight)),
+        _by_vertex(stencil.back),
+        _by_vertex(stencil.back_weight),
         stencil.rest_from.reshape(-1),
         (stencil.rest_to * positions + position).reshape(-1),
         stencil.rest_weight.reshape(-1),
     )
 
 
-def _sum_positions(make, inputs: jax.Array, stencil: Stencil, *, axis: int) -> jax.Array:
+def _by_vertex(table: AnyArray) -> AnyArray:
+    """Reshape (S, J, M) to (J, M * S)."""
+    return table.transpose(1, 2, 0).reshape(table.shape[1], -1)
+
+
+def _sum_positions(
+    make: Callable[[jax.Array], jax.Array], inputs: jax.Array, stencil: Stencil, *, axis: int
+) -> jax.Array:
     """Return the sum over positions s of stencil_s @ make(inputs[s]), with the vertices along `axis`."""
     one = jax.eval_shape(make, inputs[0])
     shape = one.shape[:axis] + stencil.source.shape[2:] + one.shape[axis + 1 :]
 
-    def add(total, position):
+    def add(total: jax.Array, position: tuple[jax.Array, Stencil]) -> tuple[jax.Array, None]:
         data, tables = position
         return total + _stencil_p.bind(make(data), *tables, axis=axis, transposed=False), None
 
@@ -124,7 +144,7 @@ def _sum_positions(make, inputs: jax.Array, stencil: Stencil, *, axis: int) -> j
 _stencil_p = Primitive("stencil")
 
 
-def _apply(x: jax.Array, *tables: jax.Array, axis: int, transposed: bool) -> jax.Array:
+def _apply(x: AnyArray, *tables: AnyArray, axis: int, transposed: bool) -> jax.Array:
     t = Stencil(*tables)
     if not transposed:
         return _gather(x, t.source, t.weight, axis)
@@ -134,41 +154,41 @@ def _apply(x: jax.Array, *tables: jax.Array, axis: int, transposed: bool) -> jax
     return place.add(rest, mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _gather(x: jax.Array, index: jax.Array, weight: jax.Array, axis: int) -> jax.Array:
+def _gather(x: AnyArray, index: AnyArray, weight: AnyArray, axis: int) -> jax.Array:
     """Return the sum over k of weight[k] x[index[k]]."""
     if len(index) <= _FEW_LISTS or jax.default_backend() == "cpu":
-        return sum(_weigh(w, _take(x, i, axis), axis) for i, w in zip(index, weight, strict=True))
+        return jnp.asarray(sum(_weigh(w, _take(x, i, axis), axis) for i, w in zip(index, weight, strict=True)))
     return jnp.sum(_weigh(weight, _take(x, index, axis), axis), axis=axis)
 
 
-def _take(x: jax.Array, index: jax.Array, axis: int) -> jax.Array:
-    place = x.at[(slice(None),) * axis + (index,)]
+def _take(x: AnyArray, index: AnyArray, axis: int) -> jax.Array:
+    place = jnp.asarray(x).at[(slice(None),) * axis + (index,)]
     return place.get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _weigh(weight: jax.Array, x: jax.Array, axis: int) -> jax.Array:
-    return weight.astype(x.dtype).reshape(weight.shape + (1,) * (x.ndim - axis - weight.ndim)) * x
+def _weigh(weight: AnyArray, x: jax.Array, axis: int) -> jax.Array:
+    return jnp.asarray(weight).astype(x.dtype).reshape(weight.shape + (1,) * (x.ndim - axis - weight.ndim)) * x
 
 
-def _abstract(x, *tables, axis, transposed):
-    t = Stencil(*tables)
+def _abstract(x: ShapedArray, *tables: ShapedArray, axis: int, transposed: bool) -> ShapedArray:
+    source, _, back, *_ = tables
     shape = list(x.shape)
-    shape[axis] = (t.back if transposed else t.source).shape[1]
+    shape[axis] = (back if transposed else source).shape[1]
     return x.update(shape=tuple(shape))
 
 
-def _jvp(primals, tangents, **options):
+def _jvp(primals: Sequence[Any], tangents: Sequence[Any], **options: Any) -> tuple[jax.Array, jax.Array]:
     x, *tables = primals
     slope = ad.instantiate_zeros(tangents[0])
     return _stencil_p.bind(x, *tables, **options), _stencil_p.bind(slope, *tables, **options)
 
 
-def _transpose(cotangent, _, *tables, axis, transposed):
+def _transpose(cotangent: Any, _: Any, *tables: jax.Array, axis: int, transposed: bool) -> list[jax.Array | None]:
     back = _stencil_p.bind(ad.instantiate_zeros(cotangent), *tables, axis=axis, transposed=not transposed)
-    return [back] + [None] * len(tables)
+    return [back, *[None] * len(tables)]
 
 
-def _batch(arguments, axes, **options):
+def _batch(arguments: Sequence[jax.Array], axes: Sequence[Any], **options: Any) -> tuple[jax.Array, int]:
     x, *tables = arguments
     if any(a is not None for a in axes[1:]):
         raise ValueError("vmap over the tables of a hierarchy: expected one hierarchy for the whole batch")

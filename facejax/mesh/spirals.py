@@ -8,19 +8,20 @@ the directions of neighbouring spirals. Tables are (N, S) int32; entry N is a du
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Int32, Integer, Real
 
 from facejax.mesh import graph
 
 
 def build(
-    vertices: np.ndarray,
-    faces: np.ndarray,
+    vertices: Real[np.ndarray, "N 3"],
+    faces: Integer[np.ndarray, "F 3"],
     *,
     reference: int,
     length: int | None = None,
     rings: int = 2,
     dilation: int = 1,
-) -> np.ndarray:
+) -> Int32[np.ndarray, "N S"]:
     """Return the spirals (N, S) int32 of a mesh of vertices (N, 3) and faces (F, 3).
 
     S is `length`, or int(mean + 2 std) of the number of vertices within `rings` rings; longer spirals are truncated,
@@ -34,13 +35,15 @@ def build(
         sizes = [len(_walk(v, ring[0], around, rings=rings)[::dilation]) for v, ring in enumerate(around)]
         length = max(1, int(np.mean(sizes) + 2 * np.std(sizes)))
     table = np.full((len(vertices), length), len(vertices), np.int32)
-    for vertex, first in enumerate(first_neighbours(vertices, faces, around, reference)):
+    for vertex, first in enumerate(first_neighbours(vertices, faces, around, reference).tolist()):
         spiral = _walk(vertex, first, around, count=1 + (length - 1) * dilation)[::dilation]
         table[vertex, : len(spiral)] = spiral[:length]
     return table
 
 
-def first_neighbours(vertices: np.ndarray, faces: np.ndarray, around: list[list[int]], reference: int) -> np.ndarray:
+def first_neighbours(
+    vertices: Real[np.ndarray, "N 3"], faces: Integer[np.ndarray, "F 3"], around: list[list[int]], reference: int
+) -> Integer[np.ndarray, " N"]:
     """Return each vertex's first neighbour (N,): the predecessor on the shortest path from the reference.
 
     A component that is not connected to the reference takes its vertex nearest to the reference instead. A
@@ -53,7 +56,7 @@ def first_neighbours(vertices: np.ndarray, faces: np.ndarray, around: list[list[
     distance, first = graph.paths(vertices, faces, sources)
     while not np.isfinite(distance).all():
         lost = np.flatnonzero(~np.isfinite(distance))
-        sources.append(lost[np.argmin(straight[lost])])
+        sources.append(int(lost[np.argmin(straight[lost])]))
         distance, first = graph.paths(vertices, faces, sources)
     for source in sources:
         ring = np.array(around[source])
@@ -72,7 +75,7 @@ def _walk(
     seen = {centre: first}  # vertex: the neighbour at which its own fan starts
     ring = [centre]
     while ring and (count is None or len(seen) < count) and (rings is None or rings > 0):
-        outer = []
+        outer: list[int] = []
         for vertex in ring:
             fan = around[vertex]
             start = fan.index(seen[vertex])

@@ -9,9 +9,13 @@ read it: as many slots as 90 % of the vertices need, and a short remainder that 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from jaxtyping import Float32, Int32, Integer, Real
+
+if TYPE_CHECKING:
+    from facejax.geometry.sphere import AnyArray
 
 
 class Stencil(NamedTuple):
@@ -23,16 +27,21 @@ class Stencil(NamedTuple):
     r]] for every r with rest_to[s, r] = m.
     """
 
-    source: np.ndarray  # (S, K, V) int32, below M
-    weight: np.ndarray  # (S, K, V) float32
-    back: np.ndarray  # (S, J, M) int32, below V
-    back_weight: np.ndarray  # (S, J, M) float32
-    rest_from: np.ndarray  # (S, R) int32, below V
-    rest_to: np.ndarray  # (S, R) int32, below M
-    rest_weight: np.ndarray  # (S, R) float32
+    source: Int32[AnyArray, "S K V"]  # below M
+    weight: Float32[AnyArray, "S K V"]
+    back: Int32[AnyArray, "S J M"]  # below V
+    back_weight: Float32[AnyArray, "S J M"]
+    rest_from: Int32[AnyArray, "S R"]  # below V
+    rest_to: Int32[AnyArray, "S R"]  # below M
+    rest_weight: Float32[AnyArray, "S R"]
 
 
-def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse: int) -> Stencil:
+def build(
+    spirals: Integer[np.ndarray, "V S"],
+    corners: Integer[np.ndarray, "W K"],
+    weights: Real[np.ndarray, "W K"],
+    coarse: int,
+) -> Stencil:
     """Return the maps of spirals (V, S) on a signal of W vertices, upsampled from `coarse` ones.
 
     Corners and weights (W, K) are the upsampling. Usually V = W: the spirals of all vertices. W marks the dummy vertex,
@@ -62,7 +71,8 @@ def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse:
     back[position[fits], place[fits], target[fits]] = reader[fits]
     back_weight[position[fits], place[fits], target[fits]] = value[fits]
 
-    position, target, reader, value = (a[~fits] for a in (position, target, reader, value))
+    left = ~fits
+    position, target, reader, value = position[left], target[left], reader[left], value[left]
     sizes = np.bincount(position, minlength=length)
     place = np.arange(len(position)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     rest_from, rest_to = np.zeros((2, length, sizes.max()), np.int32)
@@ -71,7 +81,7 @@ def build(spirals: np.ndarray, corners: np.ndarray, weights: np.ndarray, coarse:
     return Stencil(source, weight, back, back_weight, rest_from, rest_to, rest_weight)
 
 
-def flat(spirals: np.ndarray) -> Stencil:
+def flat(spirals: Integer[np.ndarray, "V S"]) -> Stencil:
     """Return the maps of spirals (V, S) on a signal of the same V vertices, without upsampling."""
     own = np.arange(len(spirals))[:, None]
     return build(spirals, own, np.ones_like(own, np.float32), len(spirals))

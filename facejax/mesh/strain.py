@@ -13,19 +13,21 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Float32, Int32, Integer
 
+from facejax.geometry.sphere import AnyArray
 from facejax.mesh import normals
 
 
 class VertexTriangles(NamedTuple):
     """The triangles, and those adjacent to each vertex."""
 
-    faces: np.ndarray  # (F, 3) int32
-    about: np.ndarray  # (N, W) int32; F marks an empty slot
-    count: np.ndarray  # (N,) float32
+    faces: Int32[AnyArray, "F 3"]
+    about: Int32[AnyArray, "N W"]  # F marks an empty slot
+    count: Float32[AnyArray, " N"]  # pyright: ignore[reportIncompatibleMethodOverride]  a field, not tuple's method
 
 
-def vertex_triangles(faces: np.ndarray, count: int) -> VertexTriangles:
+def vertex_triangles(faces: Integer[np.ndarray, "F 3"], count: int) -> VertexTriangles:
     """Return the tables of triangles (F, 3) on `count` vertices."""
     owner = np.argsort(faces.ravel(), kind="stable")
     vertex = faces.ravel()[owner]
@@ -37,7 +39,9 @@ def vertex_triangles(faces: np.ndarray, count: int) -> VertexTriangles:
 
 
 @jax.jit
-def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles) -> tuple[jax.Array, jax.Array]:
+def strain(
+    displacements: Float[AnyArray, "N B 3"], neutral: Float[AnyArray, "N B 3"], tables: VertexTriangles
+) -> tuple[Float[Array, "N B 6"], Float[Array, "N B 3"]]:
     """Return the strain (N, B, 6) of displacements (N, B, 3) of a neutral face (N, B, 3), and its normals (N, B, 3).
 
     Strain has no unit: 0.1 is an elongation by a tenth; xx, yy, zz, xy, xz, yz in the axes of the mesh. Normals have
@@ -55,6 +59,7 @@ def strain(displacements: jax.Array, neutral: jax.Array, tables: VertexTriangles
     slope = sum(
         (corner - moved[0])[..., :, None] * dual[..., None, :] for corner, dual in zip(moved[1:], duals, strict=True)
     )
+    slope = jnp.asarray(slope)
     within = slope - normal[..., :, None] * jnp.sum(normal[..., :, None] * slope, axis=-2, keepdims=True)
     squared = jnp.sum(slope[..., :, :, None] * slope[..., :, None, :], axis=-3)
     green = 0.5 * (within + jnp.swapaxes(within, -1, -2) + squared)

@@ -19,15 +19,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from facejax.models import lstm, pca
 
 STARTS = ("zero", "neutral")
-RETURN_FRACTION, QUIET_STEPS = (
-    0.3,
-    5,
-)  # an expression is over when it has come back so far, and been quiet for so many frames
+# An expression ends when its amplitude is below this fraction of the peak and it is still for this many frames.
+RETURN_FRACTION, QUIET_STEPS = 0.3, 5
 
 
 class Config(NamedTuple):
@@ -109,7 +107,9 @@ def measure(
 
 @jax.jit
 def predict(
-    params: ExpressionLSTM, steps: Float[Array, "... T L 3"], neutral: Float[Array, "... L 3"] | None = None
+    params: ExpressionLSTM,
+    steps: Float[Array | np.ndarray, "... T L 3"],
+    neutral: Float[Array | np.ndarray, "... _ 3"] | None = None,  # not L: another number gets the error of `_check`
 ) -> Float[Array, "... T L 3"]:
     """Predict the step that follows each of the recorded steps (teacher forcing).
 
@@ -127,9 +127,9 @@ def predict(
 @jax.jit
 def predict_scheduled(
     params: ExpressionLSTM,
-    steps: Float[Array, "... T L 3"],
+    steps: Float[Array | np.ndarray, "... T L 3"],
     given: Bool[Array | np.ndarray, "... T"],
-    neutral: Float[Array, "... L 3"] | None = None,
+    neutral: Float[Array | np.ndarray, "... _ 3"] | None = None,
 ) -> Float[Array, "... T L 3"]:
     """Predict as `predict`, but feed back the last prediction where `given` (..., T) is false (scheduled sampling).
 
@@ -153,7 +153,7 @@ def generate(
     prefix: Float[Array | np.ndarray, "... P L 3"] | None = None,
     *,
     frames: int,
-    stop: float = 0.0,
+    stop: float | Real[Array, ""] = 0.0,
 ) -> Float[Array, "... frames L 3"]:
     """Generate a curve that starts at 0, by feeding the network's output back.
 
@@ -185,7 +185,9 @@ def generate(
 
 
 @jax.jit
-def expression_length(curve: Float[Array | np.ndarray, "... T L 3"], *, fraction: float = 0.01) -> Int[Array, "*lead"]:
+def expression_length(
+    curve: Float[Array | np.ndarray, "... T L 3"], *, fraction: float | Real[Array, ""] = 0.01
+) -> Int[Array, "*lead"]:
     """Return the number of frames that belong to the expression; T if it does not end.
 
     It ends at the first frame whose displacement is at most 0.3 of the largest one before it, and after which 5 steps
@@ -204,10 +206,12 @@ def expression_length(curve: Float[Array | np.ndarray, "... T L 3"], *, fraction
     return jnp.where(jnp.any(over, axis=-1), jnp.argmax(over, axis=-1) + 1, curve.shape[-3])
 
 
-def _encode(params: ExpressionLSTM, steps: Array, neutral: Array | None) -> tuple[Array, Array]:
+def _encode(
+    params: ExpressionLSTM, steps: Array | np.ndarray, neutral: Array | np.ndarray | None
+) -> tuple[Array, Array]:
     """Return the network's inputs (..., T, D), the first replaced by neutral landmarks, and the base of its outputs."""
     scale = jax.lax.stop_gradient(params.scale)
-    x = (steps / scale.step).reshape(*steps.shape[:-2], -1)
+    x = jnp.asarray(steps / scale.step).reshape(*steps.shape[:-2], -1)
     if scale.basis is not None:
         x = x @ scale.basis
     base = scale.carry * x

@@ -18,7 +18,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Real
 
 from facejax.models import layers as dense_layers
 from facejax.models.layers import Weights
@@ -53,20 +54,21 @@ def init(key: Array, size: int, *, hidden: int = 128, layers: int = 3) -> Weight
 
 
 @jax.jit
-def forward(weights: Weights, x: Float[Array, "T B D"]) -> Float[Array, "T B D"]:
+def forward(weights: Weights, x: Float[Array | np.ndarray, "T B D"]) -> Float[Array, "T B D"]:
     """Return the outputs for known inputs; layer by layer, with the input product outside of the scan."""
+    signal = jnp.asarray(x)
     for row in weights["layers"]:
-        x = _layer(row, x)
-    return dense_layers.dense(weights["dense"], x)
+        signal = _layer(row, signal)
+    return dense_layers.dense(weights["dense"], signal)
 
 
 @jax.jit
 def forward_scheduled(
     weights: Weights,
-    x: Float[Array, "T B D"],
-    given: Bool[Array, "T B"],
-    base: Float[Array, "T B D"] | None = None,
-    carry: float | Float[Array, ""] = 0.0,
+    x: Float[Array | np.ndarray, "T B D"],
+    given: Bool[Array | np.ndarray, "T B"],
+    base: Float[Array | np.ndarray, "T B D"] | None = None,
+    carry: float | Real[Array, ""] = 0.0,
 ) -> Float[Array, "T B D"]:
     """Return the outputs with scheduled sampling: the input is x where `given`, else the previous output.
 

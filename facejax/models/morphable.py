@@ -64,7 +64,10 @@ def fit(examples: np.ndarray, *, components: int) -> MorphableModel:
 
 
 @jax.jit
-def apply(params: MorphableModel, coefficients: Float[Array | np.ndarray, "*lead k"]) -> Float[Array, "*lead N C"]:
+def apply(
+    params: MorphableModel,
+    coefficients: Float[Array | np.ndarray, " ..."],  # looser than (..., k), so that a scalar gets the error below
+) -> Float[Array, "... N C"]:
     """Return the values of faces with coefficients in standard deviations; zero is the mean.
 
     Raises:
@@ -89,7 +92,7 @@ def project(params: MorphableModel, values: Float[Array | np.ndarray, "*lead N C
     return along / params.deviation
 
 
-def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -> Array:
+def direction(examples: np.ndarray, scores: np.ndarray, *, unit: bool = False) -> Float[Array, "N C"]:
     """Return the change of a face (N, C) that increases an attribute: sum_i mu_i (S_i - mean), Seo & Luo 2021, eq. 1.
 
     S are examples (M, N, C) and mu their scores (M,). The S_i - mean sum to zero, so that adding a constant to mu has
@@ -145,7 +148,11 @@ def fit_identity_expression(
 
 
 @jax.jit
-def face(model: IdentityExpressionModel, identity: Array, expression: Array) -> Array:
+def face(
+    model: IdentityExpressionModel,
+    identity: Float[Array | np.ndarray, "... k"],
+    expression: Float[Array | np.ndarray, "... l"],
+) -> Float[Array, "... N 3"]:
     """Return vertices (..., N, 3) in mm from identity coefficients (..., k) and expression coefficients (..., l).
 
     Leading axes broadcast: one identity serves all frames. Zero expression coefficients are the mean expression; the
@@ -162,7 +169,7 @@ def face(model: IdentityExpressionModel, identity: Array, expression: Array) -> 
     return _apply(model.identity, "identity", identity) + _apply(model.expression, "expression", expression)
 
 
-def variance_kept(params: MorphableModel) -> np.ndarray:
+def variance_kept(params: MorphableModel) -> Float[np.ndarray, " k"]:
     """Return the share of the examples' variance kept by the first 1 ... k components, (k,) float64 on the host."""
     return np.cumsum(np.square(params.deviation, dtype=np.float64)) / np.float64(params.total_variance)
 

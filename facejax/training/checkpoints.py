@@ -31,7 +31,7 @@ class Checkpoints:
     The `keep` newest steps stay on disk.
     """
 
-    def __init__(self, folder: str | os.PathLike, *, keep: int = 3):
+    def __init__(self, folder: str | os.PathLike[str], *, keep: int = 3):
         self.folder = Path(folder).absolute()
         self._manager = ocp.CheckpointManager(
             self.folder,

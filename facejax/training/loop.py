@@ -80,7 +80,7 @@ def run(
     step: Step,
     state: TrainState,
     batches: Callable[[int, int], Tree],
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     steps: int,
     constants: Tree = (),

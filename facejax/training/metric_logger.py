@@ -23,7 +23,7 @@ class MetricLogger:
     name.
     """
 
-    def __init__(self, folder: str | os.PathLike, done: int, steps: int, *, tensorboard: bool = False):
+    def __init__(self, folder: str | os.PathLike[str], done: int, steps: int, *, tensorboard: bool = False):
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / "metrics.jsonl"
@@ -87,7 +87,7 @@ class NullLogger:
         """Do nothing."""
 
 
-def read(folder: str | os.PathLike) -> list[dict[str, float]]:
+def read(folder: str | os.PathLike[str]) -> list[dict[str, float]]:
     """Return the entries of a run, oldest first; a truncated last line is skipped."""
     entries = []
     path = Path(folder) / "metrics.jsonl"
@@ -99,7 +99,7 @@ def read(folder: str | os.PathLike) -> list[dict[str, float]]:
     return entries
 
 
-def claim_folder(folder: str | os.PathLike, what: dict[str, Any]) -> None:
+def claim_folder(folder: str | os.PathLike[str], what: dict[str, Any]) -> None:
     """Record the configuration of a run in its folder.
 
     Without it, a checkpoint of matching shapes could be resumed with another seed, plan or dataset.

@@ -56,7 +56,7 @@ def shard(tree: Tree, sharding: NamedSharding) -> Tree:
 def unshard(tree: Tree) -> Tree:
     """Copy arrays to uncommitted arrays on the default device."""
 
-    def one(leaf: jax.Array) -> jax.Array:
+    def one(leaf: Any) -> jax.Array:
         if _is_key(leaf):
             return jax.random.wrap_key_data(one(jax.random.key_data(leaf)), impl=jax.random.key_impl(leaf))
         # An array shared with other processes is whole on every device; one of this process may be split.
@@ -66,7 +66,9 @@ def unshard(tree: Tree) -> Tree:
     return jax.tree.map(one, tree)
 
 
-def data_parallel(step: Callable, *, axis: int = 0, device_mesh: Mesh | None = None) -> Callable:
+def data_parallel(
+    step: Callable[[Tree, Tree, Tree], Tree], *, axis: int = 0, device_mesh: Mesh | None = None
+) -> Callable[[Tree, Tree, Tree], Tree]:
     """Return a `step(state, batch, constants)` that splits each batch among devices along an axis of its leaves.
 
     By default among all devices. The result is to be jitted, as any `loop.Step`. JAX's partitioner splits the work and

@@ -12,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, PartitionSpec
+from jax.typing import ArrayLike
 
 from facejax import losses
 from facejax.training.loop import Metrics, Step, TrainState, Tree
+
+Loss = Callable[[Tree, jax.Array, Tree, Tree], tuple[ArrayLike, Metrics]]  # of params, key, batch and constants
 
 
 class Players(NamedTuple):
@@ -24,7 +27,7 @@ class Players(NamedTuple):
     critic: Any
 
 
-def supervised(loss: Callable, optimiser: optax.GradientTransformation) -> Step:
+def supervised(loss: Loss, optimiser: optax.GradientTransformation) -> Step:
     """Return an optimiser step on `loss(params, key, batch, constants) -> (scalar, metrics)`."""
 
     def step(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
@@ -74,13 +77,13 @@ def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int] | np.n
         raise ValueError(f"names: expected {len(ids)} unique names, one per model, got {list(names)}")
     model_ids = jnp.asarray(ids)
 
-    def one(common, parts):
+    def one(common: Tree, parts: Tree) -> tuple[Tree, Metrics]:
         (number_of_steps, run_key, shared), (params, opt_state, extra, number, batch, own) = common, parts
         key = jax.random.fold_in(run_key, number)
         found, metrics = step(TrainState(number_of_steps, params, opt_state, key, extra), batch, (own, shared))
         return (found.params, found.opt_state, found.extra), metrics
 
-    def several(common, stacked):
+    def several(common: Tree, stacked: Tree) -> tuple[Tree, Metrics]:
         each = partial(one, common)
         return jax.lax.map(each, stacked) if jax.default_backend() == "cpu" else jax.vmap(each)(stacked)
 
@@ -91,8 +94,9 @@ def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int] | np.n
         mapped = several
         if count > 1:
             mesh, split = Mesh(np.array(devices[:count]), ("models",)), PartitionSpec("models")
-            specs = {"in_specs": (PartitionSpec(), split), "out_specs": split}
-            mapped = jax.shard_map(several, mesh=mesh, check_vma=False, **specs)
+            mapped = jax.shard_map(
+                several, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
+            )
         stacked = (state.params, state.opt_state, state.extra, model_ids, batch, own)
         (params, opt_state, extra), metrics = mapped((state.step, state.key, shared), stacked)
         means = {name: jnp.mean(values) for name, values in metrics.items()}
@@ -108,13 +112,13 @@ def init_vectorized_models(params: Tree, optimiser: optax.GradientTransformation
 
 
 def adversarial(
-    generate: Callable,
-    score: Callable,
+    generate: Callable[[Tree, Tree, jax.Array, Tree], Tree],
+    score: Callable[[Tree, Tree, Tree, Tree], jax.Array],
     optimisers: Players,
     *,
     critic_steps: int = 5,
     penalty: float = 10.0,
-    terms: Callable | None = None,
+    terms: Callable[[Tree, Tree, Tree, Tree], Metrics] | None = None,
     decay: float = 0.999,
 ) -> Step:
     """Return a Wasserstein GAN step with gradient penalty: `critic_steps` critic updates, then one of the generator.
@@ -144,11 +148,11 @@ def adversarial(
         fake = many(generator, constants, jax.random.split(noise_key, size), batch[1])
         rounds = jax.tree.map(lambda leaf: leaf.reshape(critic_steps, -1, *leaf.shape[1:]), (*batch, fake))
 
-        def judge(carry, data):
+        def judge(carry: tuple[Tree, Tree], data: Tree) -> tuple[tuple[Tree, Tree], Metrics]:
             critic, opt_state = carry
             key, (real, condition, fake) = data
 
-            def loss(critic):
+            def loss(critic: Tree) -> tuple[jax.Array, Metrics]:
                 return losses.critic(
                     lambda sample, condition: score(critic, constants, sample, condition),
                     key, real, fake, condition, penalty=penalty,
@@ -162,7 +166,7 @@ def adversarial(
 
         real, condition, _ = jax.tree.map(lambda leaf: leaf[-1], rounds)
 
-        def play(generator):
+        def play(generator: Tree) -> tuple[ArrayLike, Metrics]:
             fake = many(generator, constants, jax.random.split(play_key, size // critic_steps), condition)
             adversarial = losses.generator(lambda *x: score(critic, constants, *x), fake, condition)
             added = terms(constants, fake, real, condition) if terms else {}
@@ -184,6 +188,6 @@ def init_adversarial(params: Players, optimisers: Players, key: jax.Array) -> Tr
     return TrainState(jnp.int32(0), params, opt_state, key, extra=params.generator)
 
 
-def _descend(optimiser, slope: Tree, opt_state: Tree, params: Tree) -> tuple[Tree, Tree]:
+def _descend(optimiser: optax.GradientTransformation, slope: Tree, opt_state: Tree, params: Tree) -> tuple[Tree, Tree]:
     updates, opt_state = optimiser.update(slope, opt_state, params)
     return optax.apply_updates(params, updates), opt_state

@@ -1,14 +1,22 @@
 """Labelled grids of pictures, and captions below the frames of a video."""
 
 import os
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
 from facejax.io import atomic
 
 
-def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.ndarray:
+def contact_sheet(
+    rows: Iterable[Iterable[ArrayLike]],
+    row_labels: Sequence[str] | None = None,
+    column_labels: Sequence[str] | None = None,
+    *,
+    gap: int = 4,
+) -> np.ndarray:
     """Arrange pictures in a labelled grid, (height, width, 3) uint8.
 
     Args:
@@ -51,13 +59,13 @@ def contact_sheet(rows, row_labels=None, column_labels=None, *, gap=4) -> np.nda
     return np.asarray(sheet)
 
 
-def save(path: str | os.PathLike, pixels) -> None:
+def save(path: str | os.PathLike[str], pixels: ArrayLike) -> None:
     """Write a picture (height, width, 3) uint8 as PNG, atomically."""
     with atomic.replace_file(path) as temporary:
         Image.fromarray(np.asarray(pixels, np.uint8)).save(temporary)
 
 
-def caption(pictures, captions) -> np.ndarray:
+def caption(pictures: ArrayLike, captions: Sequence[tuple[int, str]]) -> np.ndarray:
     """Add a strip with the current caption below each frame.
 
     Args:
@@ -88,7 +96,7 @@ def _load_font(size: float) -> ImageFont.FreeTypeFont:
     return font
 
 
-def _font(text: str, size: int, width: float):
+def _font(text: str, size: int, width: float) -> ImageFont.FreeTypeFont:
     """Return Pillow's built-in font at the given size, or smaller if the text is wider than `width`."""
     while (font := _load_font(size)).getlength(text) > width and size > 6:
         size -= 1

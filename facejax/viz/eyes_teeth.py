@@ -7,10 +7,12 @@ T frames, P vertices of a set of teeth, K of its triangles; millimetres, y up, z
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.geometry import align
 from facejax.mesh import graph
@@ -80,7 +82,13 @@ def parts(template: Props, neutral: np.ndarray, landmarks: np.ndarray) -> tuple[
 
 
 def eyeball(
-    centre, radius: float, *, gaze=(0.0, 0.0, 1.0), iris=(0.30, 0.42, 0.46), iris_radius=5.9, sectors=32
+    centre: ArrayLike,
+    radius: float,
+    *,
+    gaze: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
+    iris: ArrayLike = (0.30, 0.42, 0.46),
+    iris_radius: float = 5.9,
+    sectors: int = 32,
 ) -> scene.Part:
     """Build an eye: white, iris with a dark rim, pupil.
 
@@ -116,7 +124,7 @@ def eyeball(
     b = (np.arange(len(rings) - 1)[:, None] * sectors + (np.arange(sectors) + 1) % sectors).ravel()
     faces = np.concatenate([np.stack([a, a + sectors, b + sectors], -1), np.stack([a, b + sectors, b], -1)])
     vertices = np.asarray(centre)[..., None, :] + radius * ball.reshape(-1, 3) @ frame
-    colour = np.repeat([colour for _, colour in rings], sectors, axis=0)
+    colour = np.repeat(np.array([colour for _, colour in rings]), sectors, axis=0)
     return scene.Part(vertices.astype(np.float32), faces.astype(np.int32), colour.astype(np.float32), 1.0)
 
 
@@ -148,6 +156,6 @@ def _scale_teeth(teeth: np.ndarray) -> np.ndarray:
     return (centre + TEETH_SCALE * (teeth - centre) - [0, 0, TEETH_SETBACK]).astype(np.float32)
 
 
-def _fit(source: np.ndarray, target: np.ndarray, which, *, scaling: bool) -> align.Similarity:
+def _fit(source: np.ndarray, target: np.ndarray, which: Iterable[int], *, scaling: bool) -> align.Similarity:
     index = np.array(list(which))
     return align.procrustes(source[..., index, :], target[..., index, :], scaling=scaling)

@@ -11,9 +11,11 @@ import json
 import os
 import string
 import zlib
+from collections.abc import Sequence
 from importlib import resources
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.io import atomic
 from facejax.viz import render, scene, shading
@@ -22,16 +24,16 @@ _ASPECT = (4, 5)
 
 
 def write(
-    path: str | os.PathLike,
-    vertices,
-    faces,
+    path: str | os.PathLike[str],
+    vertices: ArrayLike,
+    faces: ArrayLike,
     *,
-    fps=30.0,
-    captions=(),
-    title="facejax",
-    landmarks=None,
-    extras=(),
-    colours=None,
+    fps: float = 30.0,
+    captions: scene.Captions = (),
+    title: str = "facejax",
+    landmarks: ArrayLike | None = None,
+    extras: Sequence[scene.PartLike] = (),
+    colours: ArrayLike | None = None,
 ) -> None:
     """Write the page, atomically.
 
@@ -56,7 +58,7 @@ def write(
         temporary.write_text(text, "utf-8")
 
 
-def _fields(animation: scene.Scene, title: str, colours) -> dict[str, str]:
+def _fields(animation: scene.Scene, title: str, colours: ArrayLike | None) -> dict[str, str]:
     count, face = animation.vertices.shape[:2]
     skin = np.asarray(scene.SKIN if colours is None else colours, np.float32)
     if skin.shape not in ((3,), (face, 3)):

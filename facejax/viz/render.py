@@ -5,9 +5,11 @@ Smooth shading (interpolated normals), one perspective camera for a whole motion
 pixels on one core. T frames, N vertices, F faces, L landmarks; millimetres.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.mesh import graph
 from facejax.viz import rasterizer, scene, shading
@@ -42,7 +44,26 @@ class Camera(NamedTuple):
     zoom: float
 
 
-def fit_camera(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, margin=0.05) -> Camera:
+class Options(TypedDict, total=False):
+    """Options of `frames` that `image` takes as well."""
+
+    size: tuple[int, int]
+    camera: Camera | None
+    colours: ArrayLike | None
+    extras: Sequence[scene.PartLike]
+    background: ArrayLike
+    samples: int
+
+
+def fit_camera(
+    vertices: ArrayLike,
+    *,
+    size: tuple[int, int] = (256, 320),
+    turn: float = 0.0,
+    tilt: float = 0.0,
+    field: float = 20.0,
+    margin: float = 0.05,
+) -> Camera:
     """Return a camera that has every given vertex, in all frames, in the picture.
 
     Args:
@@ -69,16 +90,16 @@ def fit_camera(vertices, *, size=(256, 320), turn=0.0, tilt=0.0, field=20.0, mar
 
 
 def frames(
-    vertices,
-    faces,
+    vertices: ArrayLike,
+    faces: ArrayLike,
     *,
-    size=(256, 320),
-    camera=None,
-    colours=None,
-    landmarks=None,
-    extras=(),
-    background=(0.93, 0.94, 0.96),
-    samples=2,
+    size: tuple[int, int] = (256, 320),
+    camera: Camera | None = None,
+    colours: ArrayLike | None = None,
+    landmarks: ArrayLike | None = None,
+    extras: Sequence[scene.PartLike] = (),
+    background: ArrayLike = (0.93, 0.94, 0.96),
+    samples: int = 2,
 ) -> np.ndarray:
     """Render every frame from one fixed camera.
 
@@ -121,12 +142,14 @@ def frames(
     return pictures
 
 
-def image(vertices, faces, *, landmarks=None, **options) -> np.ndarray:
+def image(
+    vertices: ArrayLike, faces: ArrayLike, *, landmarks: ArrayLike | None = None, **options: Unpack[Options]
+) -> np.ndarray:
     """Render one picture (height, width, 3) uint8 of vertices (N, 3); options as of `frames`."""
     return frames(np.asarray(vertices)[None], faces, landmarks=landmarks, **options)[0]
 
 
-def heat_colours(values, *, low=0.0, high=None) -> np.ndarray:
+def heat_colours(values: ArrayLike, *, low: float = 0.0, high: float | None = None) -> np.ndarray:
     """Map values (...) to colours (..., 3): pale, yellow, orange, dark red; `high` defaults to the maximum."""
     values = np.asarray(values, np.float64)
     high = float(values.max()) if high is None else high
@@ -167,7 +190,7 @@ def _layer(part: scene.Part, t: int) -> _Layer:
     return _Layer(vertices, scene.normals(vertices, part.faces), colours, part.faces, part.gloss)
 
 
-def _draw(layers: list[_Layer], dots, view: Camera, picture: np.ndarray, samples: int) -> np.ndarray:
+def _draw(layers: list[_Layer], dots: np.ndarray | None, view: Camera, picture: np.ndarray, samples: int) -> np.ndarray:
     """Draw layers over a linear backdrop (height, width, 3) counted in samples; return sRGB pixels."""
     height, width = picture.shape[:2]
     offsets = np.cumsum([0] + [len(layer.vertices) for layer in layers])
@@ -227,7 +250,7 @@ def _stamp(picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, view: Camer
         patch += cover * (np.array(LANDMARK_COLOUR, np.float32) - patch)
 
 
-def _backdrop(colour, size, samples: int) -> np.ndarray:
+def _backdrop(colour: ArrayLike, size: tuple[int, int], samples: int) -> np.ndarray:
     """Return a vertical gradient (height, width, 3) linear float32, counted in samples."""
     height = size[1] * samples
     fall = np.linspace(1.03, 0.86, height, dtype=np.float32)[:, None, None]

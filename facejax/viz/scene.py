@@ -4,13 +4,17 @@ T frames, N vertices, F faces, L landmarks, M vertices and K faces of a part. Mi
 A colour is sRGB in [0, 1], one `(3,)` for a part or `(M, 3)` for its vertices.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from facejax.mesh.normals import vertex_normals_host
 
 SKIN = (0.86, 0.70, 0.62)
+GLOSS = 0.3
+Captions: TypeAlias = Sequence[tuple[int, str]]  # (first frame, text)
 
 
 class Part(NamedTuple):
@@ -25,7 +29,11 @@ class Part(NamedTuple):
     vertices: np.ndarray
     faces: np.ndarray
     colour: np.ndarray | tuple[float, float, float]
-    gloss: float = 0.3
+    gloss: float = GLOSS
+
+
+# A part, or a tuple of vertices, faces, colour and perhaps gloss.
+PartLike: TypeAlias = tuple[ArrayLike, ArrayLike, ArrayLike, *tuple[float, ...]]
 
 
 class Scene(NamedTuple):
@@ -47,7 +55,15 @@ class Scene(NamedTuple):
     extras: tuple[Part, ...] = ()
 
 
-def make(vertices, faces, *, fps=30.0, captions=(), landmarks=None, extras=()) -> Scene:
+def make(
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    *,
+    fps: float = 30.0,
+    captions: Captions = (),
+    landmarks: ArrayLike | None = None,
+    extras: Sequence[PartLike] = (),
+) -> Scene:
     """Return a validated scene with all fields.
 
     Args:
@@ -74,7 +90,7 @@ def make(vertices, faces, *, fps=30.0, captions=(), landmarks=None, extras=()) -
         float(fps),
         _captions(captions, len(vertices)),
         _landmarks(landmarks, vertices),
-        tuple(_part(Part(*part), i, len(vertices)) for i, part in enumerate(extras)),
+        tuple(_part(i, len(vertices), *part) for i, part in enumerate(extras)),
     )
 
 
@@ -89,22 +105,22 @@ def colours(part: Part) -> np.ndarray:
     return np.broadcast_to(np.asarray(part.colour, np.float32), (part.vertices.shape[-2], 3))
 
 
-def _part(part: Part, i: int, frames: int) -> Part:
+def _part(i: int, frames: int, vertices: ArrayLike, faces: ArrayLike, colour: ArrayLike, gloss: float = GLOSS) -> Part:
     where = f"extras[{i}]"
-    vertices, faces = np.asarray(part.vertices, np.float32), _faces(part.faces, f"{where}.faces")
+    vertices, faces = np.asarray(vertices, np.float32), _faces(faces, f"{where}.faces")
     if vertices.ndim not in (2, 3) or vertices.shape[-1] != 3 or 0 in vertices.shape:
         raise ValueError(f"{where}.vertices must be (M, 3) or (T, M, 3), got {vertices.shape}")
     if vertices.ndim == 3 and len(vertices) != frames:
         raise ValueError(f"{where}.vertices must have {frames} frames, got {len(vertices)}")
     _finite(vertices, f"{where}.vertices")
     _in_range(faces, vertices.shape[-2], f"{where}.faces")
-    colour = np.asarray(part.colour, np.float32)
+    colour = np.asarray(colour, np.float32)
     if colour.shape not in ((3,), (vertices.shape[-2], 3)):
         raise ValueError(f"{where}.colour must be (3,) or ({vertices.shape[-2]}, 3), got {colour.shape}")
-    return Part(vertices, faces, colour, float(part.gloss))
+    return Part(vertices, faces, colour, float(gloss))
 
 
-def _landmarks(landmarks, vertices: np.ndarray) -> np.ndarray | None:
+def _landmarks(landmarks: ArrayLike | None, vertices: np.ndarray) -> np.ndarray | None:
     if landmarks is None:
         return None
     landmarks = np.asarray(landmarks)
@@ -119,7 +135,7 @@ def _landmarks(landmarks, vertices: np.ndarray) -> np.ndarray | None:
     return landmarks
 
 
-def _captions(captions, frames: int) -> tuple[tuple[int, str], ...]:
+def _captions(captions: Captions, frames: int) -> tuple[tuple[int, str], ...]:
     captions = tuple(sorted((int(frame), str(text)) for frame, text in captions))
     for frame, text in captions:
         if not 0 <= frame < frames:
@@ -127,7 +143,7 @@ def _captions(captions, frames: int) -> tuple[tuple[int, str], ...]:
     return captions
 
 
-def _faces(faces, name: str) -> np.ndarray:
+def _faces(faces: ArrayLike, name: str) -> np.ndarray:
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[-1] != 3 or not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"{name} must be (F, 3) integers, got {faces.shape} {faces.dtype}")

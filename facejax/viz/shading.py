@@ -61,7 +61,9 @@ def neighbours(faces: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray, 
     return start, end, np.maximum(np.bincount(start, minlength=points), 1)
 
 
-def cavity(vertices: np.ndarray, normals: np.ndarray, neighbours) -> np.ndarray:
+def cavity(
+    vertices: np.ndarray, normals: np.ndarray, neighbours: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> np.ndarray:
     """Return brightness (N,), below 1 in concave and above 1 in convex regions: bounded curvature times edge length."""
     start, end, count = neighbours
     step = vertices[end] - vertices[start]

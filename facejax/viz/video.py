@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from facejax.io import atomic
@@ -14,7 +15,7 @@ from facejax.io import atomic
 FORMATS = (".webp", ".gif", ".mp4")
 
 
-def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
+def write(path: str | os.PathLike[str], frames: ArrayLike, *, fps: float = 30.0, quality: int = 88) -> None:
     """Write pictures as a video, atomically. WebP and GIF loop and may merge equal frames; the timing is kept.
 
     Args:
@@ -45,7 +46,7 @@ def write(path: str | os.PathLike, frames, *, fps=30.0, quality=88) -> None:
         first.save(temporary, save_all=True, append_images=rest, duration=durations, loop=0, **options)
 
 
-def check(path: str | os.PathLike) -> str:
+def check(path: str | os.PathLike[str]) -> str:
     """Return the suffix of a video that can be written on this machine; raise as `write` does otherwise."""
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:

@@ -114,22 +114,13 @@ BOMBS = {
     "lines": Bomb("a.csv", many(b"", b"\n", 180), "livelink"),
     "landmarks": Bomb("a.txt", many(b"", b"1\n", 250), "landmarks"),
     "nested_landmarks": Bomb("a.json", nested, "landmarks"),
-    "nested_index": Bomb("index.json", nested, "store"),
-    "index": Bomb("index.json", many(b"[", b"[],", 250), "store"),
-    "index_within_bounds": Bomb("index.json", many(b"[", b"[],", 23), "store"),
+    "nested_index": Bomb("index.json", nested, "dataset"),
+    "index": Bomb("index.json", many(b"[", b"[],", 250), "dataset"),
+    "index_within_bounds": Bomb("index.json", many(b"[", b"[],", 23), "dataset"),
     "corpus_index": Bomb("index.json", many(b"[", b"[],", 23), "corpus"),
     "tensors": Bomb("a.safetensors", lambda path: path.write_bytes(struct.pack("<Q", 2**40) + b"{}"), "weights"),
     "header": Bomb("a.safetensors", many(struct.pack("<Q", 90 * MEGABYTE), b"[", 90), "weights"),
 }  # fmt: skip
-
-
-def peak_mb() -> float:
-    """Return the peak memory of this process in MB.
-
-    From /proc, which starts anew with the program: `getrusage` counts what the parent held when it forked.
-    """
-    status = Path("/proc/self/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def main() -> None:
@@ -139,11 +130,12 @@ def main() -> None:
     bomb.write(path)
     from facejax.data import corpora, dataset
     from facejax.io import landmarks, livelink, meshes, safe_pickle, weights
+    from tests.faults._record import peak_mb
 
     readers = {
         "mesh": (meshes.read, meshes.MeshError), "pickle": (safe_pickle.read, safe_pickle.PickleError),
         "livelink": (livelink.read, livelink.RecordingError), "landmarks": (landmarks.read, landmarks.LandmarkError),
-        "store": (lambda path: dataset.open_dataset(path.parent), dataset.DatasetError),
+        "dataset": (lambda path: dataset.open_dataset(path.parent), dataset.DatasetError),
         "corpus": (lambda path: corpora.load(path.parent), corpora.CorpusError),
         "weights": (lambda path: weights.load(path, {}), weights.WeightsError),
     }  # fmt: skip

@@ -163,7 +163,7 @@ def readers() -> dict[str, Callable[[], Reader]]:
 
         return read
 
-    def store_index() -> Reader:
+    def dataset_index() -> Reader:
         arrays = {"faces": FACES, "neutral": VERTICES[None].astype("f4"), "vertices": VERTICES[None].astype("f4")}
         arrays |= {"landmarks": VERTICES[None, :2].astype("f4"), "drawn": np.zeros(1, np.int64)}
         arrays["landmark_index"] = np.arange(2, dtype=np.int32)
@@ -257,7 +257,7 @@ def readers() -> dict[str, Callable[[], Reader]]:
         "livelink": recording,
         "safetensors": released,
         "models": models,
-        "store": store_index,
+        "dataset": dataset_index,
         "corpus": corpus_index,
     }  # fmt: skip
 
@@ -270,6 +270,8 @@ def _write_glb(path: Path) -> None:
 
 def run(name: str, count: int, seed: int) -> dict:
     """Count how often a reader accepted, rejected and crashed."""
+    from tests.faults._record import peak_mb
+
     reader, rng = readers()[name](), random.Random(f"{name} {seed}")
     outcome = {"reader": name, "files": count, "taken": 0, "refused": 0, "crashed": [], "slowest_s": 0.0}
     with tempfile.TemporaryDirectory() as root:
@@ -304,15 +306,6 @@ def run(name: str, count: int, seed: int) -> dict:
                 outcome["crashed"].append([number, f"left {left}"])
     outcome["peak_mb"] = peak_mb()
     return outcome
-
-
-def peak_mb() -> float:
-    """Return the peak memory of this process in MB.
-
-    From /proc, which starts anew with the program: `getrusage` counts what the parent held when it forked.
-    """
-    status = Path("/proc/self/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
 
 def main() -> None:

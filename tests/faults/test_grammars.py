@@ -185,7 +185,7 @@ CONTENTS = {
     "csv": lines("subject,recording,label", "A,#,smile", "A,#", "B,one,#,#", "# c"),
     "livelink": recording(),
     "safetensors": tensors(),
-    "store": st.one_of(*(changed(whole) for whole in KNOWN["store"]().files)),
+    "dataset": st.one_of(*(changed(whole) for whole in KNOWN["dataset"]().files)),
     "corpus": st.one_of(*(changed(whole) for whole in KNOWN["corpus"]().files)),
 }  # fmt: skip
 

@@ -37,9 +37,9 @@ def finished(process):
 
 
 def killed(command, longest, *, after=""):
-    """Start a command and kill it and its children within so many seconds, counted from its first line with `after`.
+    """Start a command and kill it and its children within `longest` seconds; return whether it was still running.
 
-    Whether it was still running.
+    Seconds count from its first line with `after`.
     """
     process = started(command)
     for line in process.stdout if after else ():

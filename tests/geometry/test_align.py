@@ -1,7 +1,8 @@
-"""Alignment: against loops and SciPy, laws, and gradients that survive equal singular values."""
+"""Alignment: compared with loops and SciPy; invariances; gradients, also with equal singular values."""
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from jax.test_util import check_grads
@@ -189,7 +190,8 @@ def test_interpolate_gradients(x64):
         (lambda c: align.resample(c, frames=3, by="length"), '"time" or "arc", got \'length\''),
     ],
 )
-def test_wrong_input_is_named(call, match):
+def test_wrong_input_is_named(call, match, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with pytest.raises(ValueError, match=match):
         call(jnp.ones((6, 4, 3)))
 

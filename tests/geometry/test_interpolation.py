@@ -1,4 +1,4 @@
-"""Smoothstep: values, slopes, and the kind of array that goes in comes out."""
+"""Smoothstep: values and slopes; NumPy arrays give NumPy arrays, JAX arrays JAX arrays."""
 
 import jax
 import jax.numpy as jnp

@@ -1,9 +1,10 @@
-"""Radial basis functions: against a loop and against SciPy, laws, and every refusal."""
+"""Radial basis functions: compared with a loop and with SciPy; invariances; every error message."""
 
 import warnings
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +17,7 @@ from facejax.geometry import rbf
 
 KERNELS = tuple(rbf.KERNELS)
 DEFINITE = tuple(name for name in KERNELS if rbf.KERNELS[name].definite)
-# Kernel, and whether with the affine term: without it only where that is allowed.
+# Kernel, and whether the affine term is used; without it only definite kernels are allowed.
 FORMS = [(name, True) for name in KERNELS] + [(name, False) for name in DEFINITE]
 # SciPy's name, and its epsilon times the unit.
 PEERS = {
@@ -38,14 +39,14 @@ def random(seed, *shape):
 
 
 def scattered(seed, count=12):
-    """Landmarks in a box that keep a distance, as those of a face do."""
+    """Return landmarks (count, 3) in a box, with a minimum distance between them, as on a face."""
     grid = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     rng = np.random.default_rng(seed)
     return 10 * (rng.permutation(grid)[:count] + rng.uniform(-0.2, 0.2, (count, 3)))
 
 
 def loop_warp(rest, displacements, vertices, phi, unit, smoothing=0.0, affine=True):
-    """s(v) by the textbook: fill the system entry by entry, solve, add up."""
+    """Return s(v) of the vertices by loops: fill the system, solve it, sum over the landmarks."""
     count, extra = len(rest), 4 if affine else 0
     system, right = np.zeros((count + extra, count + extra)), np.zeros((count + extra, 3))
     for i in range(count):
@@ -202,7 +203,7 @@ def test_displacements_may_be_traced_and_vertices_may_not(head):
 
 
 def motion(frames=6):
-    """Landmarks of a face that bend by some 5 mm, there and back."""
+    """Return displacements (frames, 68, 3) of about 5 mm that start and end at 0."""
     return np.sin(np.linspace(0, np.pi, frames))[:, None, None] * 3 * random(13, 68, 3)
 
 
@@ -219,7 +220,7 @@ def test_refit_agrees_where_it_should(head, kernel):
     np.testing.assert_allclose(
         rbf.refit(rest, bend, vertices, kernel=kernel), rbf.apply(found, bend, vertices), atol=2e-4
     )
-    # Elsewhere it depends on the path: back at rest, the landmarks are and the vertices are not.
+    # Elsewhere the result depends on the path: the landmarks return to rest, the vertices do not.
     np.testing.assert_allclose(d[-1], 0, atol=1e-12)
     np.testing.assert_allclose(once[-1], 0, atol=1e-9)
     assert np.abs(again[-1]).max() > 0.05
@@ -238,12 +239,13 @@ def test_refit_against_a_loop():
     np.testing.assert_allclose(rbf.refit(rest, d, vertices, kernel="gaussian", sigma=1.0), expected, atol=1e-5)
 
 
-def test_refit_names_the_frame_where_landmarks_meet(head):
+def test_refit_names_the_frame_where_landmarks_meet(head, monkeypatch):
     rest, vertices = head
     d = np.zeros((4, 68, 3))
     d[2, 66] = rest[62] - rest[66]
     with pytest.raises(ValueError, match="frame 3: landmarks 62 and 66 coincide"):
         rbf.refit(rest, d, vertices)
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with pytest.raises(ValueError, match=r"displacements: expected \(T, 68, 3\), got \(4, 67, 3\)"):
         rbf.refit(rest, d[:, 1:], vertices)
 
@@ -282,7 +284,8 @@ FLAT = scattered(19) * [1, 1, 0]
         ),
     ],
 )
-def test_wrong_input_is_named(call, match):
+def test_wrong_input_is_named(call, match, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(ValueError, match=match):

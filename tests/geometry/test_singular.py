@@ -1,8 +1,8 @@
-"""Laws over many random points near the sets where formulas break down, values and gradients, in both precisions.
+"""Values and gradients at many random points near singular sets, in both precisions.
 
-Points are pairs at angles from 1e-12 to pi less 1e-12 and exactly 0 and pi; motions are curves in units from 1e-12 to
-1e12 with pauses, steps that differ by twelve orders, and standstill; clouds are flat, thin, single points and mirror
-images.
+Pairs of points on the sphere have angles from 1e-12 to pi - 1e-12, and 0 and pi exactly. Curves have units from 1e-12
+to 1e12, some steps of zero, and steps that differ by twelve orders of magnitude; some are constant. Point sets for the
+alignment are flat, collinear, coincident or mirrored.
 """
 
 import jax
@@ -18,11 +18,11 @@ STEPS, LANDMARKS = 3, 2
 
 
 def pairs(dtype):
-    """Points p and q (COUNT, T-1, L, 3), and a tangent vector at p, of unit length."""
+    """Return points p and q (COUNT, T-1, L, 3), and a tangent vector at p, of unit length."""
     rng = np.random.default_rng(0)
     p, u = rng.normal(size=(2, COUNT, STEPS, LANDMARKS, 3))
     p = unit(p)
-    # Some along the axes, where the fixed direction of the antipode changes.
+    # Some points on the axes, where the fixed direction for the antipode changes.
     p[::10] = 0
     p[np.arange(0, COUNT, 10), 0, 0, rng.integers(0, 3, COUNT // 10)] = np.sqrt(STEPS)
     u = unit(u - p * np.einsum("ktlc,ktlc->k", u, p)[:, None, None, None] / STEPS)
@@ -31,7 +31,7 @@ def pairs(dtype):
     theta[::7], theta[3::7] = 0, np.pi
     q = np.cos(theta)[:, None, None, None] * p + np.sin(theta)[:, None, None, None] * u
     q[::7], q[3::7] = p[::7], -p[3::7]
-    p[:10], q[5:15] = 0, 0  # motions at standstill
+    p[:10], q[5:15] = 0, 0  # constant motions
     return tuple(jnp.asarray(x, dtype) for x in (p, q, u))
 
 
@@ -40,7 +40,7 @@ def unit(x):
 
 
 def curves(dtype):
-    """Motions (COUNT, T, L, 3)."""
+    """Return curves (COUNT, T, L, 3)."""
     rng = np.random.default_rng(1)
     steps = rng.normal(size=(COUNT, STEPS, LANDMARKS, 3)) * 10.0 ** rng.uniform(-12, 0, (COUNT, STEPS, 1, 1))
     steps[rng.random((COUNT, STEPS)) < 0.2] = 0
@@ -70,7 +70,7 @@ def test_the_sphere(dtype):
     )
     moved = finite(sphere.transport, p, q, u)
     assert np.abs(length(moved) - 1)[whole].max() < 64 * eps
-    # The nearer to the antipode, the more of p + q, and so of the way, is rounding.
+    # Near the antipode p + q is small, and its relative rounding error large.
     off = np.abs(np.asarray(sphere.inner(q, moved))) * np.minimum(length(np.asarray(p) + np.asarray(q)), 1)
     assert off[whole].max() < 64 * eps
     for function in (sphere.inner, sphere.project):
@@ -82,7 +82,7 @@ def test_roots(dtype):
     squared = 10.0 ** np.random.default_rng(4).uniform(-80, 30, COUNT)  # in float32 nearly half of them are 0
     squared[:100] = 0
     squared = np.asarray(squared, dtype)
-    squared[squared < np.finfo(dtype).tiny] = 0  # as XLA has it
+    squared[squared < np.finfo(dtype).tiny] = 0  # XLA flushes denormal numbers to 0
     np.testing.assert_allclose(finite(sphere.safe_sqrt, jnp.asarray(squared)), np.sqrt(squared), rtol=1e-6)
 
 
@@ -116,7 +116,7 @@ def test_the_transform(dtype):
 
 
 def clouds(dtype):
-    """Points (COUNT, 4, 3) and what they are to be brought onto: turned, mirrored, thin, flat, single."""
+    """Return sources and targets (COUNT, 4, 3): rotated, mirrored, nearly flat or collinear, coincident."""
     rng = np.random.default_rng(3)
     source = rng.normal(size=(COUNT, 4, 3)) * 10.0 ** rng.uniform(-9, 0, (COUNT, 1, 3))
     turn = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
@@ -161,7 +161,7 @@ def test_transitions(dtype):
     for frame, end, size in ((0, p, sizes[0]), (-1, q, sizes[1])):
         wanted = np.asarray(srvf.displacement(end, size)).sum(axis=1)
         off = np.abs(found[:, frame] - wanted).max(axis=(1, 2)) / np.exp(np.asarray(size))
-        assert off[15:].max() < 64 * np.finfo(dtype).eps  # before them, one of both is at standstill, and on no sphere
+        assert off[15:].max() < 64 * np.finfo(dtype).eps  # in the first 15 a motion is constant, and not on the sphere
 
 
 def test_halves(dtype):
@@ -176,7 +176,7 @@ def test_halves(dtype):
 
 
 def landmarks(rng):
-    """Five landmarks: two of them near one another, all near a plane or a line, far from the origin, large or small."""
+    """Return landmarks (5, 3): two nearly coincident, or all near a plane or a line; some far from the origin."""
     rest = rng.normal(size=(5, 3))
     kind = rng.integers(4)
     if kind == 0:
@@ -190,7 +190,7 @@ def landmarks(rng):
 
 
 def test_warps():
-    """Landmarks are refused, or met."""
+    """Either `fit` raises an error, or the landmarks are interpolated."""
     rng, refused = np.random.default_rng(6), 0
     for _ in range(COUNT):
         rest = landmarks(rng)
@@ -199,7 +199,7 @@ def test_warps():
         except ValueError:
             refused += 1
             continue
-        # float32 keeps of a place only so much, and the system is solved in units of the landmarks' distances.
+        # The weights are float32, and the system is solved in units of the landmarks' spacing.
         weights = rbf.weights(found, rest)
         assert np.abs(weights - np.eye(5)).max() < 1e-4
         assert np.isfinite(rbf.weights(found, rest[:3] + np.ptp(rest) * rng.normal(size=(3, 3)))).all()

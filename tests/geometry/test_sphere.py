@@ -1,7 +1,8 @@
-"""The sphere: definitions against loops, laws of exp and log, gradients at and off singular points."""
+"""The sphere: compared with loops; identities of exp and log; gradients at singular points and elsewhere."""
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -52,7 +53,7 @@ def loop_inner(a, b):
 
 
 def angle_at(p, theta):
-    """A point at the angle theta from p, in float64."""
+    """Return a point at the angle theta from p, in float64."""
     p = np.asarray(p, np.float64)
     return np.cos(theta) * p + np.sin(theta) * unit_tangent(9, p)
 
@@ -88,7 +89,7 @@ def test_maps_against_the_formulas_of_the_paper(x64):
 def test_distance_keeps_relative_precision(x64, theta):
     p = points(3, 1)[0]
     q = jnp.asarray(angle_at(p, theta))
-    # A point cannot hold an angle to better than the spacing of its entries.
+    # The rounding of a point's entries limits the precision of an angle.
     np.testing.assert_allclose(sphere.distance(p, q), theta, rtol=1e-13, atol=3e-16)
     np.testing.assert_allclose(sphere.norm(sphere.log(p, q)), theta, rtol=1e-13, atol=3e-16)
 
@@ -261,7 +262,7 @@ def cluster(seed, count, spread, dtype=jnp.float64):
 
 
 def loop_karcher(qs):
-    """Gradient descent with a small step, on the formulas of the paper."""
+    """Return the mean by gradient descent with a small step, by the formulas of the paper."""
     p = np.asarray(qs[0])
     for _ in range(400):
         step = np.zeros_like(p)
@@ -321,6 +322,7 @@ def test_karcher_mean_gradient_is_exact(x64):
         (lambda p: sphere.karcher_mean(p[None], steps=0), "at least 1, got 0"),
     ],
 )
-def test_wrong_input_is_named(call, match):
+def test_wrong_input_is_named(call, match, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with pytest.raises(ValueError, match=match):
         call(jnp.ones(SHAPE))

@@ -1,4 +1,4 @@
-"""The boundary's loops."""
+"""Boundary loops of a mesh."""
 
 import numpy as np
 

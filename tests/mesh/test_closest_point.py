@@ -1,4 +1,4 @@
-"""Closest points of a surface against a search of every triangle."""
+"""Closest points of a surface, compared with a search of all triangles."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_large_triangles_are_found_from_afar():
 
 @pytest.mark.parametrize("size", [10, 200])
 def test_normals_tell_two_sheets_apart(size):
-    # Two sheets 1 apart, the upper looking up and the lower down: lips that touch.
+    # Two sheets at a distance of 1, their normals pointing away from each other, as those of touching lips.
     sheet = size * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     vertices = np.concatenate([sheet, sheet + [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]])
@@ -59,7 +59,7 @@ def test_the_far_side_of_a_hole_is_its_edge():
 
 
 def soup(seed, count=300):
-    """Triangles (F, 3, 3) anywhere, from a thousandth to a hundred in size; some have no area."""
+    """Return triangles (F, 3, 3) of sizes from 0.001 to 100 at random positions; some have no area."""
     rng = np.random.default_rng(seed)
     size = 10.0 ** rng.uniform(-3, 2, (count, 1, 1))
     found = 20 * rng.normal(size=(count, 1, 3)) + size * rng.normal(size=(count, 3, 3))
@@ -82,7 +82,7 @@ def test_triangles_of_all_sizes_against_a_search_of_every_triangle(seed, turn):
     else:
         hits = closest_point.closest_points(on, points, normals=looking, normal_weight=turn)
         cost += turn * (1 - looking @ on.planes.T)
-    # Where a triangle has no area, trimesh may miss its nearest point.
+    # trimesh may return a wrong closest point of a triangle without area.
     whole = np.setdiff1d(np.arange(len(triangles)), np.arange(0, len(triangles), 50))
     row = np.arange(len(points))
     got = hits.distance + (0 if turn is None else turn * (1 - np.sum(looking * on.planes[hits.face], axis=1)))

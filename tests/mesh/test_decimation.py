@@ -1,4 +1,4 @@
-"""Decimation keeps true subsets; the closest point is the closest of densely sampled ones."""
+"""Decimation to subsets of the vertices; upsampling, compared with a search of all triangles."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def test_decimated_mesh_is_a_consistent_subset():
     np.testing.assert_array_equal(group[kept], np.arange(len(kept)))
     mesh = trimesh.Trimesh(vertices[kept], coarse, process=False)
     assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.9 * BALL.volume
-    # A group lies about the vertex that stands for it.
+    # The members of a group lie near the vertex that represents them.
     assert np.linalg.norm(vertices - vertices[kept][group], axis=1).max() < 0.6
 
 

@@ -1,5 +1,6 @@
-"""Deformation transfer against least squares with a row per triangle, and what it does to fields that are known."""
+"""Deformation transfer: compared with a dense least-squares solution; fields whose transfer is known."""
 
+import jaxtyping
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +10,7 @@ from facejax.mesh.deformation_transfer import DeformationTransfer, anchor_weight
 
 BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 N, FACES = len(BALL.vertices), np.asarray(BALL.faces)
-MOVING = np.full(N, 10.0)  # mm: so far that nothing is held
+MOVING = np.full(N, 10.0)  # mm: so much that anchors have almost no weight
 
 
 def field(seed, *shape):
@@ -17,17 +18,17 @@ def field(seed, *shape):
 
 
 def face(seed):
-    """An uneven ball of some 50 mm."""
+    """Return the vertices (N, 3) of a deformed sphere of about 50 mm."""
     return 50 * np.asarray(BALL.vertices) @ (np.eye(3) + 0.2 * field(seed, 3, 3)) + 2 * field(seed + 50, N, 3)
 
 
 def smooth(seed, count):
-    """Waves on the ball, in mm."""
+    """Return smooth fields (count, N, 3) on the sphere, in mm."""
     return np.sin(2 * BALL.vertices @ field(seed, count, 3, 3) + field(seed + 50, count, 1, 3))
 
 
 def grid(seed):
-    """A flat patch, its inner points moved within the plane."""
+    """Return vertices and faces of a flat patch, its inner vertices displaced within the plane."""
     x, y = np.meshgrid(np.arange(6.0), np.arange(5.0))
     points = np.stack([x, y, 0 * x], axis=-1)
     points[1:-1, 1:-1, :2] += 0.3 * np.random.default_rng(seed).uniform(-1, 1, (3, 4, 2))
@@ -37,7 +38,7 @@ def grid(seed):
 
 
 def slope(vertices, corners, values):
-    """The gradient (3,) of corner values within a triangle: in its plane, with the right differences along edges."""
+    """Return the gradient (3,) of a triangle's corner values: in its plane, with their differences along edges."""
     a, b, c = vertices[corners]
     rows = np.stack([b - a, c - a, np.cross(b - a, c - a)])
     return np.linalg.solve(rows, [values[1] - values[0], values[2] - values[0], 0])
@@ -95,7 +96,7 @@ def test_an_affine_field_of_a_flat_patch_stays_affine():
     found = DeformationTransfer(source, target, faces, anchor_weights(np.full(len(source), 10.0)))(
         (source @ matrix)[None]
     )[0]
-    # Where the whole lies gradients do not say; what the vertices are held to does: their mean stays.
+    # Gradients leave a translation free; the anchors determine it: the mean displacement is kept.
     expected = target @ matrix
     np.testing.assert_allclose(found, expected - expected.mean(axis=0) + (source @ matrix).mean(axis=0), atol=1e-5)
 
@@ -129,7 +130,7 @@ def test_vertices_that_never_move_are_held():
     fields = np.where(lower[:, None], 0.0, smooth(1, 3))
     held = DeformationTransfer(face(0), face(1), FACES, anchor_weights(np.where(lower, 0.0, 10.0)))(fields)
     free = DeformationTransfer(face(0), face(1), FACES, anchor_weights(MOVING))(fields)
-    # The gradients leave open where the whole lies: so that what was still stays where it was.
+    # Gradients leave a translation free; anchors keep the vertices in place that do not move on the source.
     held, free = (np.linalg.norm(carried[:, lower].mean(axis=1), axis=-1) for carried in (held, free))
     assert (held < 1e-4).all() and (free > 1e-2).all()
 
@@ -149,7 +150,8 @@ def test_settled_fields_come_back():
     )  # fmt: skip
 
 
-def test_faces_of_different_shapes_are_named():
+def test_faces_of_different_shapes_are_named(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with pytest.raises(
         ValueError, match=r"source and target .* of one shape .* got \(162, 3\), \(161, 3\) and \(162,\)"
     ):

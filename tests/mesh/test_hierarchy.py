@@ -32,7 +32,7 @@ def test_levels_fit_together(hierarchy):
         assert np.isin(hierarchy.kept[level + 1], hierarchy.kept[level]).all()
         assert hierarchy.spirals[level].shape == (sizes[level], OPTIONS["lengths"][level])
         np.testing.assert_array_equal(hierarchy.spirals[level][:, 0], np.arange(sizes[level]))
-        # A kept vertex is lifted from itself alone.
+        # A kept vertex is interpolated from itself alone.
         rows = np.searchsorted(hierarchy.kept[level], hierarchy.kept[level + 1])
         lifted = np.zeros((sizes[level], sizes[level + 1]))
         np.add.at(
@@ -73,12 +73,12 @@ def test_surface_stencil_is_the_spirals(hierarchy):
 
 
 def test_inverse_lists_leave_a_remainder(hierarchy):
-    # Otherwise the tests of the transposed map would not see the scattered part.
+    # Otherwise the tests of the transposed map would not cover the scattered part.
     assert all(stencil.rest_weight.any() for stencil in (*hierarchy.climbs, hierarchy.surface))
 
 
 def dense(stencil, position, fine, coarse):
-    """Both readings of one position's map as (fine, coarse) matrices."""
+    """Return one position's map as matrices (fine, coarse): by the forward and by the transposed tables."""
     forward, backward = np.zeros((2, fine, coarse), np.float32)
     for index, weight in zip(stencil.source[position], stencil.weight[position], strict=True):
         np.add.at(forward, (np.arange(fine), index), weight)
@@ -111,7 +111,7 @@ def test_cache_returns_the_same_and_survives_damage(hierarchy, tmp_path, monkeyp
     first = mesh_hierarchy.build(VERTICES, FACES, cache=tmp_path, **OPTIONS)
     (file,) = tmp_path.iterdir()
     assert_same(first, hierarchy)
-    monkeypatch.setattr(mesh_hierarchy, "_build", None)  # from here on, only the file can answer
+    monkeypatch.setattr(mesh_hierarchy, "_build", None)  # from here on, a result can only come from the cached file
     assert_same(mesh_hierarchy.build(VERTICES, FACES, cache=tmp_path, **OPTIONS), hierarchy)
     monkeypatch.undo()
     whole = file.read_bytes()

@@ -1,4 +1,4 @@
-"""Normals against a loop over triangles, by JAX and by NumPy."""
+"""Normals by JAX and by NumPy, compared with a loop over triangles."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ FORMS = {"jax": vertex_normals, "host": vertex_normals_host}
 
 
 def loop(vertices):
-    """Unit normals (N, 3), by one triangle after another."""
+    """Return unit normals (N, 3), summed triangle by triangle."""
     total = np.zeros(vertices.shape)
     for a, b, c in FACES:
         p = np.asarray(vertices, np.float64)
@@ -25,7 +25,7 @@ def loop(vertices):
 
 
 def uneven(*lead):
-    """A rough ball (..., N, 3) float32."""
+    """Return spheres (..., N, 3) float32 with noise."""
     noise = np.random.default_rng(1).normal(size=(*lead, *VERTICES.shape))
     return np.asarray(VERTICES + 0.05 * noise, np.float32)
 
@@ -66,7 +66,7 @@ def test_normals_are_zero_without_area_or_triangle(form):
         assert not np.asarray(FORMS[form](vertices, faces)).any()
     up = np.asarray(FORMS[form](fold, cancelling[:1]))
     np.testing.assert_array_equal(up, [[0, 0, 1]] * 3 + [[0, 0, 0]])
-    # A picture needs some normal everywhere: there it is the one towards the camera.
+    # Rendering needs a normal everywhere: here the one towards the camera.
     np.testing.assert_array_equal(scene.normals(fold, cancelling), [[0, 0, 1]] * 4)
 
 

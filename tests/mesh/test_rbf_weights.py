@@ -1,4 +1,4 @@
-"""Landmarks on a mesh: on it or off it, the rim that they do not reach, and the way there."""
+"""RBF weights of landmarks on a mesh: validity checks, distant boundary, falloff, separation of the lips."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def landmarks(template):
 
 
 def sheet(side=21):
-    """A flat square of side^2 vertices, 1 apart, with landmarks in its middle."""
+    """Return a flat square of side^2 vertices at distance 1, its faces, and four landmarks in its middle."""
     y, x = np.divmod(np.arange(side * side), side)
     i = np.arange(side * side).reshape(side, side)
     a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
@@ -63,7 +63,7 @@ def test_falloff_is_smooth_and_falls_with_distance(template, landmarks):
     factor = rbf_weights.falloff(template.vertices, template.faces, landmarks)
     a, b = graph.edges(template.faces).T
     length = np.linalg.norm(template.vertices[a] - template.vertices[b], axis=1)
-    # The steepest slope of the smooth step is 1.5 over the distance to the rim, 58 mm here.
+    # The steepest slope of the smoothstep is 1.5 divided by the distance to the boundary, 58 mm here.
     assert (np.abs(factor[a] - factor[b]) <= 1.5 * length / 57 + 1e-6).all()
     order = np.argsort(cKDTree(landmarks).query(template.vertices)[0])
     assert (np.diff(factor[order]) <= 1e-6).all()
@@ -111,7 +111,7 @@ def test_the_sides_of_the_mouth(template, landmarks):
     share = rbf_weights.upper_lip_share(template.vertices, template.faces, landmarks, rbf_weights.IBUG_LIPS)
     upper, lower = (template.landmarks[list(lip)] for lip in rbf_weights.IBUG_LIPS)
     assert (share[upper] == 1).all() and (share[lower] == 0).all()
-    # The rim of the mouth, which at rest is one line: its upper half goes with the upper lip.
+    # The boundary of the mouth, closed at rest: its upper half belongs to the upper lip.
     (rim,) = (loop for loop in graph.boundary_loops(template.faces) if len(loop) == 38)
     middle = rim[np.abs(template.vertices[rim, 0]) < 12]
     assert set(np.round(share[middle])) == {0, 1} and np.abs(share[middle] - 0.5).min() > 0.45
@@ -176,7 +176,7 @@ def test_a_single_landmark_has_no_spacing(template):
 
 
 def test_landmarks_in_one_place_are_named_as_the_user_counts_them():
-    """Whatever is fitted to a part of them later: the lips apart, or the points of another scheme alone."""
+    """The error has the indices of all landmarks, also where a fit uses a part of them, as those of one lip."""
     shape = makehuman.template()
     marks = shape.vertices[shape.landmarks].astype(np.float64)
     marks[63] = marks[61]

@@ -1,4 +1,4 @@
-"""Laws on many fans of triangles that are thin, folded, shrunk to a line or to a point; both precisions."""
+"""Normals, strain and closest points of many thin, folded and degenerate triangles, in both precisions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,14 +12,14 @@ FACES = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]], np.int32)  # three triangles
 
 
 def fans():
-    """Vertices (COUNT, 4, 3); those of the first 150 have no area anywhere."""
+    """Return vertices (COUNT, 4, 3) of `FACES`; in the first 150 no triangle has an area."""
     rng = np.random.default_rng(0)
     found = rng.normal(size=(COUNT, 4, 3))
     thin = 10.0 ** rng.uniform(-20, 0, (COUNT, 1, 1))
     found[::5, 1:] = found[::5, :1] + thin[::5] * found[::5, 1:]  # small
-    found[1::5, :, 2:] *= thin[1::5]  # flat, and folded wherever vertex 0 is outside the others
+    found[1::5, :, 2:] *= thin[1::5]  # flat; folded where vertex 0 is outside the triangle of the others
     found[2::5, :, 1:] *= thin[2::5]  # near a line
-    found[3::5, 2] = found[3::5, 1] + thin[3::5, 0] * found[3::5, 2]  # two corners near one another
+    found[3::5, 2] = found[3::5, 1] + thin[3::5, 0] * found[3::5, 2]  # two corners nearly coincide
     found[:50] = found[:50, :1]
     found[50:100, 1:] = found[50:100, 1:2]
     found[100:150, :, 1:] = 0
@@ -70,7 +70,7 @@ def test_the_nearest_point_of_a_triangle():
 
 
 def test_the_nearest_points_of_a_surface_of_such_triangles():
-    """Some of no area, which have no normal and no barycentric weights of their own."""
+    """Some triangles have no area, and so no normal and no unique barycentric weights."""
     rng = np.random.default_rng(3)
     vertices = fans()[:500].reshape(-1, 3)
     faces = (4 * np.arange(500)[:, None, None] + FACES).reshape(-1, 3)

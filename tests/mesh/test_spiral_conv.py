@@ -1,7 +1,8 @@
-"""Spiral convolution against the plain gather-and-multiply form."""
+"""Spiral convolution, compared with gathering whole spirals and multiplying."""
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 import trimesh
@@ -19,7 +20,7 @@ def array(seed, *shape):
 
 
 def plain(x, kernel, hierarchy, *, lift):
-    """x (M, B, C): upsample, append the zero row of the dummy, gather whole spirals, multiply."""
+    """Upsample x (M, B, C), append a zero row for the dummy vertex, gather whole spirals, multiply."""
     if lift:
         x = jnp.einsum("vkbc,vk->vbc", x[hierarchy.corners[0]], hierarchy.weights[0])
     x = jnp.concatenate([x, jnp.zeros_like(x[:1])])
@@ -99,7 +100,8 @@ def test_vmap_over_tables_is_refused():
         jax.vmap(spiral_conv.spiral_conv, (None, None, 0))(x, kernel, many)
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_are_named(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     x, kernel, stencil = case(HIERARCHY, lift=True, batch=2, channels=3, out=4)
     with pytest.raises(ValueError, match=r"expected \(M, B, 3\)"):
         spiral_conv.spiral_conv(x[..., :2], kernel, stencil)

@@ -1,4 +1,4 @@
-"""Spirals on a regular triangle grid, where every ring is known, and their laws."""
+"""Spirals on a regular triangle grid, where every ring is known; their invariances."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from facejax.mesh import graph, spirals
 
 
 def hexagons(rows=7, columns=8):
-    """A patch of the triangular lattice: interior vertices have six neighbours."""
+    """Return vertices and faces of a triangular lattice: interior vertices have six neighbours."""
     y, x = np.divmod(np.arange(rows * columns), columns)
     vertices = np.stack([x + 0.5 * y, y * np.sqrt(3) / 2, np.zeros(len(x))], axis=1)
     i = np.arange(rows * columns).reshape(rows, columns)

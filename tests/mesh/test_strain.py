@@ -1,7 +1,8 @@
-"""Strain against a loop over triangles, and of motions whose strain is known."""
+"""Strain: compared with a loop over triangles; motions whose strain is known."""
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 import trimesh
@@ -20,12 +21,12 @@ def array(seed, *shape):
 
 
 def faces(batch, seed=0):
-    """Uneven balls (N, B, 3)."""
+    """Return deformed spheres (N, B, 3)."""
     return jnp.asarray(VERTICES, jnp.float32)[:, None] + 0.05 * array(seed, N, batch, 3)
 
 
 def plain(displacements, neutral, triangles):
-    """One sample (N, 3): the change of lengths in each triangle's own plane, averaged about vertices."""
+    """Return strain and normals of one sample (N, 3): of each triangle in its plane, averaged about each vertex."""
     total, normals, count = np.zeros((len(neutral), 3, 3)), np.zeros((len(neutral), 3)), np.zeros(len(neutral))
     moved = neutral + displacements
     for corners in triangles:
@@ -47,7 +48,7 @@ def plain(displacements, neutral, triangles):
 
 
 def test_tables_name_the_triangles_about_each_vertex():
-    # A vertex of its own at the end, on an open mesh.
+    # An open mesh; the last vertex belongs to no triangle.
     triangles = FACES[5:]
     tables = strain.vertex_triangles(triangles, N + 1)
     for vertex in range(N + 1):
@@ -93,7 +94,7 @@ def test_a_uniform_stretch_is_that_in_all_directions_of_the_skin(stretch):
     neutral = faces(2)
     found, _ = strain.strain(stretch * neutral, neutral, TABLES)
     exact = ((1 + stretch) ** 2 - 1) / 2
-    np.testing.assert_allclose(found[..., :3].sum(axis=-1), 2 * exact, atol=1e-5)  # two directions, none across
+    np.testing.assert_allclose(found[..., :3].sum(axis=-1), 2 * exact, atol=1e-5)  # two directions
     flat = jnp.asarray([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], jnp.float32)[:, None]
     found, normals = strain.strain(stretch * flat, flat, strain.vertex_triangles(np.array([[0, 1, 2], [1, 3, 2]]), 4))
     np.testing.assert_allclose(found[:, 0], np.broadcast_to([exact, exact, 0, 0, 0, 0], (4, 6)), atol=1e-6)
@@ -105,10 +106,10 @@ def test_turning_the_face_or_the_moved_face():
     turn = turn * jnp.sign(jnp.linalg.det(turn))
     neutral, moved = faces(2), 0.2 * array(1, N, 2, 3)
     found, normals = strain.strain(moved, neutral, TABLES)
-    # The moved face alone: strain is blind to it.
+    # A rotation of the moved face alone does not change the strain.
     alone, _ = strain.strain((neutral + moved) @ turn - neutral, neutral, TABLES)
     np.testing.assert_allclose(alone, found, atol=1e-5)
-    # Both: the tensor turns with them.
+    # A rotation of both faces rotates the tensor.
     both, turned = strain.strain(moved @ turn, neutral @ turn, TABLES)
     tensor = np.zeros((N, 2, 3, 3))
     for k, (i, j) in enumerate(SIX):
@@ -144,7 +145,8 @@ def test_gradients_and_finite_differences_agree():
         )  # fmt: skip
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_are_named(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check shapes
     with pytest.raises(ValueError, match=r"two arrays \(N, B, 3\), got \(42, 2, 3\) and \(42, 3\)"):
         strain.strain(jnp.zeros((N, 2, 3)), jnp.zeros((N, 3)), TABLES)
     with pytest.raises(ValueError, match=r"two arrays \(N, B, 3\)"):

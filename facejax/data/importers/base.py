@@ -151,7 +151,7 @@ def bounding_box_size(vertices: np.ndarray) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def natural_sort_key(name: str) -> tuple:
+def natural_sort_key(name: str) -> tuple[tuple[int | str, ...], str]:
     """Return a key that sorts numbers in names by value, and letters case-insensitively."""
     parts = re.split(r"(\d+)", name.lower())
     # Numbers are at odd positions. The name itself orders "a1" and "a01".

@@ -22,7 +22,7 @@ _NAME = re.compile(r"([FM]\d{4})_(AN|DI|FE|HA|NE|SA|SU)(\d{2})[A-Z]{2}_F3D", re.
 _SEX = {"F": "female", "M": "male"}
 
 
-def scan(root: str | os.PathLike, *, rate: float = 30.0) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = 30.0) -> Source:
     """List the emotions of the people who have a neutral mesh. `rate` is nominal: the frames are separate scans.
 
     Raises:

@@ -24,7 +24,7 @@ _NAME = re.compile(r"([FM])\d{3}", re.IGNORECASE)
 _SEX = {"F": "female", "M": "male"}
 
 
-def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
     """List the recordings; options as in `folder_scan.scan`. Raises `SourceError`, naming the file."""
     root = Path(root)
     if rest not in folder_scan.REST_OPTIONS:

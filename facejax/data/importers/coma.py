@@ -15,7 +15,7 @@ from facejax.data.importers.base import Source, SourceError
 RATE = 60.0
 
 
-def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
     """List the recordings.
 
     Raises:

@@ -16,7 +16,7 @@ RATE = 60.0
 _UNITS = re.compile(r"[0-9a-z]+(\+[0-9a-z]+)*", re.IGNORECASE)
 
 
-def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
     """List the recordings.
 
     Raises:

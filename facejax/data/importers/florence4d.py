@@ -15,7 +15,7 @@ RATE = 30.0
 FRAMES, APEX = 60, 30
 
 
-def scan(root: str | os.PathLike, *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = RATE, rest: str = "first", gaps: bool = False) -> Source:
     """List the recordings. Raises `SourceError` as `folder_scan.scan`.
 
     The paper holds out 30 women and 10 men; a table of people provides the column `sex`.

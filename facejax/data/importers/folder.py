@@ -10,16 +10,16 @@ from facejax.data.importers import folder_scan, ingest
 from facejax.data.importers.base import Source
 
 
-def scan(root: str | os.PathLike, *, rate: float = 30.0, rest: str = "first", gaps: bool = False) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = 30.0, rest: str = "first", gaps: bool = False) -> Source:
     """List recordings of any names, with frame numbers in any regular steps; see `folder_scan.scan`."""
     return folder_scan.scan(Path(root), rate=rate, rest=rest, gaps=gaps)
 
 
 def prepare(
-    root: str | os.PathLike,
-    out: str | os.PathLike,
+    root: str | os.PathLike[str],
+    out: str | os.PathLike[str],
     *,
-    landmarks: str | os.PathLike,
+    landmarks: str | os.PathLike[str],
     unit: str | None = None,
     rate: float = 30.0,
     max_meshes: int = ingest.MAX_MESHES,

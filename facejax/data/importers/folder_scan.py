@@ -10,8 +10,9 @@ Other files are skipped. The label of a recording is its name without a trailing
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from facejax.io import meshes
 MESH_SUFFIXES = (".ply", ".obj", ".npy", ".npz")
 NEUTRAL_NAME = "neutral"
 REST_OPTIONS = ("first", "mean")
+
+Content = TypeVar("Content")
 
 
 def scan(
@@ -112,8 +115,9 @@ def read_frames(rate: float, recording: RecordingInfo, frames: Sequence[int] | N
         return
     path = recording.path
     vertices, faces, extra = _as_source_error(meshes.read_animation, path, bare=True)
-    if not abs(extra.get("fps", rate) - rate) <= 1e-3 * rate:
-        raise SourceError(f"{path}: fps is {extra['fps']:g}, expected {rate:g}, the same for all recordings")
+    fps = extra.get("fps", rate)
+    if not abs(fps - rate) <= 1e-3 * rate:
+        raise SourceError(f"{path}: fps is {fps:g}, expected {rate:g}, the same for all recordings")
     for i in range(len(vertices)) if frames is None else frames:
         bad = np.flatnonzero(~np.isfinite(vertices[i]).all(axis=1))
         if len(bad):
@@ -189,7 +193,7 @@ def _frame_paths(path: Path) -> tuple[Path, ...]:
     return found
 
 
-def _as_source_error(reader, path: Path, **options):
+def _as_source_error(reader: Callable[..., Content], path: Path, **options: bool) -> Content:
     try:
         return reader(path, **options)
     except meshes.MeshError as error:

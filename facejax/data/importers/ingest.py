@@ -49,7 +49,7 @@ class Request(NamedTuple):
 
 def prepare(
     source: Source,
-    out: str | os.PathLike,
+    out: str | os.PathLike[str],
     request: Request,
     *,
     workers: int | None = None,

@@ -24,7 +24,7 @@ from facejax.io import livelink, meshes
 CHUNK = 64  # frames posed at a time
 
 
-def scan(root: str | os.PathLike, *, rate: float = 30.0, actors: int = 12, level: int = 3) -> Source:
+def scan(root: str | os.PathLike[str], *, rate: float = 30.0, actors: int = 12, level: int = 3) -> Source:
     """List every recording on every person of its performer.
 
     Args:

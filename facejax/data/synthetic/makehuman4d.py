@@ -126,7 +126,7 @@ def _generate(spec: Spec, path: Path, progress: Callable[[int, int], None]) -> N
     people = []
     with atomic.replace_folder(path) as temporary:
 
-        def array(name):
+        def array(name: str) -> np.memmap:
             return np.lib.format.open_memmap(temporary / f"{name}.npy", "w+", np.float32, shapes[name])
 
         neutral, landmarks, vertices = array("neutral"), array("landmarks"), array("vertices")
@@ -186,7 +186,7 @@ def rotate_head(vertices: np.ndarray, angles: np.ndarray) -> np.ndarray:
     one, zero = np.ones_like(pitch), np.zeros_like(pitch)
     c, s = np.cos, np.sin
 
-    def matrix(rows):
+    def matrix(rows: list[list[np.ndarray]]) -> np.ndarray:
         return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
     about_x = matrix([[one, zero, zero], [zero, c(pitch), s(pitch)], [zero, -s(pitch), c(pitch)]])

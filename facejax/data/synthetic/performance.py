@@ -120,7 +120,9 @@ def _same_on_both_sides(values: np.ndarray) -> np.ndarray:
     return values[_partner()]
 
 
-def _activation(time, begin, length, units, rng) -> np.ndarray:
+def _activation(
+    time: np.ndarray, begin: float, length: float | np.integer, units: int, rng: np.random.Generator
+) -> np.ndarray:
     """Return a minimum-jerk rise from 0 to 1 per unit, (T, units), with individual lag, speed and overshoot.
 
     All units reach 1 by begin + length.
@@ -134,17 +136,17 @@ def _activation(time, begin, length, units, rng) -> np.ndarray:
     return u**3 * (10 - 15 * u + 6 * u * u) + overshoot * bump
 
 
-def _tremor(time, units, rng) -> np.ndarray:
+def _tremor(time: np.ndarray, units: int, rng: np.random.Generator) -> np.ndarray:
     """Return a relative tremor (T, units): two slow sines of about one per cent each, per unit."""
     seconds = time[:, None] / RATE
-    total = 0.0
+    total = np.zeros((len(time), units))
     for low, high in ((1.0, 2.5), (2.5, 5.0)):
         frequency, phase = rng.uniform(low, high, units), rng.uniform(0, 2 * np.pi, units)
         total = total + 0.008 * np.sin(2 * np.pi * frequency * seconds + phase)
     return total
 
 
-def _lean(label: str, rng) -> np.ndarray:
+def _lean(label: str, rng: np.random.Generator) -> np.ndarray:
     """Return pitch, yaw, roll at the apex: random sway, plus leaning back in surprise and bowing in sadness."""
     pitch = {"surprise": 0.12, "fear": 0.08, "sadness": -0.10, "anger": -0.05}.get(label, 0.0)
     return np.array([pitch * rng.uniform(0.5, 1.5), 0, 0]) + 0.02 * rng.standard_normal(3)

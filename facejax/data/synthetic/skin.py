@@ -100,10 +100,10 @@ def template_pattern() -> Pattern:
     v, mark = shape.vertices.astype(np.float64), shape.vertices[shape.landmarks].astype(np.float64)
     front = smoothstep(v[:, 2], -5, 15)
 
-    def spot(centre, radius):
+    def spot(centre: np.ndarray, radius: float) -> np.ndarray:
         return np.exp(-0.5 * (np.linalg.norm(v - centre, axis=1) / radius) ** 2) * front
 
-    def middle(*indices):
+    def middle(*indices: int) -> np.ndarray:
         return mark[list(indices)].mean(axis=0)
 
     y, x = v[:, 1], v[:, 0]
@@ -133,7 +133,7 @@ def template_pattern() -> Pattern:
     return Pattern(tuple(furrows), owner, flesh, to_vertices, smooth)
 
 
-def _nasolabial(v, start, end, side) -> tuple[np.ndarray, np.ndarray]:
+def _nasolabial(v: np.ndarray, start: np.ndarray, end: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the signed distance from the line nose wing -> mouth corner (outward positive), and its mask."""
     axis = (end - start)[:2]
     length = float(np.linalg.norm(axis))

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Real
 
 from facejax.models.decoders import linear
 
@@ -53,8 +53,8 @@ def sparse_code(
     atoms: Float[Array | np.ndarray, "k D"],
     x: Float[Array | np.ndarray, "B D"],
     *,
-    l1: float = L1,
-    l2: float = L2,
+    l1: float | Real[Array, ""] = L1,
+    l2: float | Real[Array, ""] = L2,
     steps: int = 200,
 ) -> Float[Array, "B k"]:
     """Return the elastic-net codes of rows x in atoms, by accelerated proximal gradient descent."""
@@ -71,8 +71,8 @@ def sparse_code(
 
 
 def _learn(
-    batches: linear.Batches, *, landmark_index: np.ndarray, atoms: int = ATOMS, l1: float = L1, l2: float = L2,
-    passes: int = 2, seed: int = 0,
+    batches: linear.Batches, *, landmark_index: Int[np.ndarray, " L"], atoms: int = ATOMS, l1: float = L1,
+    l2: float = L2, passes: int = 2, seed: int = 0,
 ) -> Dictionary:  # fmt: skip
     """Learn atoms in `passes` through the batches, which are held in memory and shuffled by the seed.
 

@@ -93,7 +93,7 @@ def fit(
     return GPMM(faces, landmark_index, face, motion, motion, statistics, prior)
 
 
-def mean_face_and_motion(people: Iterable[Person]) -> tuple[np.ndarray, np.ndarray]:
+def mean_face_and_motion(people: Iterable[Person]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
     """Return the mean face (N, 3), and the root mean square displacement of its vertices over all frames (N,), in mm.
 
     Raises:
@@ -213,7 +213,9 @@ def covariances(
     return Covariances(mean[index], mean[at], within, cross, smooth_within, smooth_cross)
 
 
-def predict(known: Covariances, prior: Prior, landmarks: Float[Array | np.ndarray, "T L 3"]) -> np.ndarray:
+def predict(
+    known: Covariances, prior: Prior, landmarks: Float[Array | np.ndarray, "T L 3"]
+) -> Float[np.ndarray, "T V 3"]:
     """Return the displacements (T, V, 3) given the landmarks'; for a few frames cheaper than `linear_map`."""
     within, cross = _posterior(known, prior)
     centred = np.asarray(landmarks - known.landmark_mean).reshape(len(landmarks), -1)

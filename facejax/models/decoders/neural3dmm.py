@@ -94,8 +94,9 @@ def apply(
     params: Neural3DMM,
     hierarchy: Hierarchy,
     down: tuple[Stencil, ...],
-    displacements: Float[Array | np.ndarray, "*B L 3"],
-    neutral: Float[Array | np.ndarray, "*B N 3"],
+    # Looser than (B, L, 3) and (B, N, 3), so that wrong sizes get the error below.
+    displacements: Float[Array | np.ndarray, " ..."],
+    neutral: Float[Array | np.ndarray, " ..."],
 ) -> Float[Array, "B N 3"]:
     """Return vertex positions from landmark displacements (B, L, 3) and neutral faces (B, N, 3).
 

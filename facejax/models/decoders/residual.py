@@ -89,9 +89,10 @@ def apply(
     params: ResidualDecoder,
     hierarchy: Hierarchy,
     tables: strain.VertexTriangles,
-    displacements: Float[Array | np.ndarray, "B L 3"],
+    # Looser than (B, L, 3), (B, N, 3) and (B, N, 3) or (N, 3), so that wrong sizes get the error of `_check`.
+    displacements: Float[Array | np.ndarray, " ..."],
     base: Float[Array | np.ndarray, "B N 3"],
-    neutral: Float[Array | np.ndarray, "*B N 3"],
+    neutral: Float[Array | np.ndarray, " ..."],
 ) -> Float[Array, "B N 3"]:
     """Return refined vertex displacements from landmark displacements and a linear estimate `base`.
 

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -88,7 +89,12 @@ def init(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) -> FlowMatc
 
 @jax.jit
 def velocity(
-    params: FlowMatching, state: State, time: ArrayLike, start: ArrayLike, end: ArrayLike, pose: Float[Array, " D"]
+    params: FlowMatching,
+    state: State,
+    time: ArrayLike,
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
 ) -> State:
     """Return the field at a state and a time: a tangent vector at y (1, 1, R + 1), and the derivative of s (2,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
@@ -108,7 +114,9 @@ def velocity(
 
 
 @jax.jit
-def sample_source(chart: TangentPCA, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array, " D"]) -> State:
+def sample_source(
+    chart: TangentPCA, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
+) -> State:
     """Draw a state at time 0 from the Gaussian of a label pair and a pose, wrapped onto the sphere."""
     noise = jax.random.normal(key, (tangent_pca.SCALARS + len(chart.basis),))
     return to_state(
@@ -118,11 +126,11 @@ def sample_source(chart: TangentPCA, key: Array, start: ArrayLike, end: ArrayLik
 
 
 @jax.jit
-def to_state(chart: TangentPCA, values: Float[Array, " coordinates"]) -> State:
+def to_state(chart: TangentPCA, values: Float[Array | np.ndarray, " coordinates"]) -> State:
     """Return the state of coordinates (2 + R,): exp_p within the great sphere."""
     # Norms on the SRVF sphere are means over steps, norms of coordinates are sums.
     tangent = jnp.append(0.0, values[tangent_pca.SCALARS :]) / jnp.sqrt(len(chart.p))
-    return sphere.exp(_reference_point(chart), tangent[None, None]), values[: tangent_pca.SCALARS]
+    return sphere.exp(_reference_point(chart), tangent[None, None]), jnp.asarray(values)[: tangent_pca.SCALARS]
 
 
 @jax.jit
@@ -143,7 +151,7 @@ def sample(
     key: Array,
     start: ArrayLike,
     end: ArrayLike,
-    pose: Float[Array, " D"],
+    pose: Float[Array | np.ndarray, " D"],
     *,
     steps: int = STEPS,
 ) -> Motion:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from functools import partial
 
 import jax
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -28,7 +29,7 @@ def sample(
     key: Array,
     start: ArrayLike,
     end: ArrayLike,
-    pose: Float[Array, " D"],
+    pose: Float[Array | np.ndarray, " D"],
     *,
     steps: int = flow_matching.STEPS,
 ) -> Motion:
@@ -50,14 +51,14 @@ def sample(
     return _module(params).sample(params, key, start, end, pose)
 
 
-def kind(params: Generator) -> str:
+def kind(params: object) -> str:
     """Return "gan", "reference" or "flow".
 
     Raises:
       TypeError: parameters that are not those of a generator.
     """
     for name, record in KINDS.items():
-        if isinstance(params, record):  # pyright: ignore[reportUnnecessaryIsInstance]
+        if isinstance(params, record):
             return name
     raise TypeError(f"expected the parameters of a generator, such as models.motion; got {type(params).__name__}")
 

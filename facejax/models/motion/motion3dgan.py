@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -76,7 +77,13 @@ def _init_generator(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) 
 
 
 @jax.jit
-def _generate_coordinates(params: Motion3DGAN, noise: Array, start: ArrayLike, end: ArrayLike, pose: Array) -> Array:
+def _generate_coordinates(
+    params: Motion3DGAN,
+    noise: Float[Array | np.ndarray, " noise"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
+) -> Float[Array, " coordinates"]:
     """Return coordinates (2 + R,) from noise (128,) ~ N(0, 1), two label indices and a pose (D,)."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     _check_noise(noise, weights)
@@ -91,8 +98,12 @@ def _generate_coordinates(params: Motion3DGAN, noise: Array, start: ArrayLike, e
 
 @jax.jit
 def _generate(
-    params: Motion3DGAN, noise: Array, start: ArrayLike, end: ArrayLike, pose: Array
-) -> tuple[Array, Array, Array]:
+    params: Motion3DGAN,
+    noise: Float[Array | np.ndarray, " noise"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
+) -> tuple[Float[Array, "steps L 3"], Float[Array, ""], Float[Array, ""]]:
     """Return a tangent vector at p (T-1, L, 3), log-length and log-seconds () from noise, two labels and a pose."""
     values = _generate_coordinates(params, noise, start, end, pose)
     return tangent_pca.decode(jax.lax.stop_gradient(params.chart), values, start, end)
@@ -114,7 +125,13 @@ def _init_critic(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) -> 
 
 
 @jax.jit
-def _score(params: Motion3DGAN, values: Array, start: ArrayLike, end: ArrayLike, pose: Array) -> Array:
+def _score(
+    params: Motion3DGAN,
+    values: Float[Array | np.ndarray, " coordinates"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
+) -> Float[Array, ""]:
     """Return the critic's score () of coordinates (2 + R,), any real number; larger is more real."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     # Centred, and scaled to order one by a single factor: a factor per direction would amplify the gradient along
@@ -130,13 +147,13 @@ def _score(params: Motion3DGAN, values: Array, start: ArrayLike, end: ArrayLike,
 @jax.jit
 def _criticise(
     params: Motion3DGAN,
-    tangent: Array,
+    tangent: Float[Array | np.ndarray, "steps L 3"],
     log_length: ArrayLike,
     log_seconds: ArrayLike,
     start: ArrayLike,
     end: ArrayLike,
-    pose: Array,
-) -> Array:
+    pose: Float[Array | np.ndarray, " D"],
+) -> Float[Array, ""]:
     """Return the critic's score () of a tangent vector at p (T-1, L, 3), log-length and log-seconds ()."""
     chart = jax.lax.stop_gradient(params.chart)
     values = tangent_pca.encode(chart, tangent, log_length, log_seconds, start, end)
@@ -148,7 +165,9 @@ critic = Network(_init_critic, _criticise, _score)
 
 
 @jax.jit
-def sample(params: Motion3DGAN, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array, " D"]) -> Motion:
+def sample(
+    params: Motion3DGAN, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
+) -> Motion:
     """Draw a motion between two labels that starts at a pose."""
     noise = jax.random.normal(key, params.weights["skip"].shape[:1])
     tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
@@ -169,6 +188,6 @@ def _check_chart(chart: TangentPCA, config: Config) -> None:
         )
 
 
-def _check_noise(noise: Array, weights: Weights) -> None:
+def _check_noise(noise: Array | np.ndarray, weights: Weights) -> None:
     if noise.shape != weights["skip"].shape[:1]:
         raise ValueError(f"noise must have shape {weights['skip'].shape[:1]}; got {noise.shape}")

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
@@ -70,7 +71,9 @@ def _init_generator(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) 
 
 
 @jax.jit
-def _generate(params: Motion3DGANReference, noise: Array, start: ArrayLike, end: ArrayLike) -> tuple[Array, Array]:
+def _generate(
+    params: Motion3DGANReference, noise: Float[Array | np.ndarray, " noise"], start: ArrayLike, end: ArrayLike
+) -> tuple[Float[Array, "steps L 3"], Float[Array, ""]]:
     """Return a tangent vector at p (T-1, L, 3) and log-length () from noise (128,) ~ N(0, 1) and two label indices."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     steps, landmarks, _ = chart.p.shape
@@ -104,12 +107,16 @@ def _init_critic(key: Array, chart: TangentPCA, *, config: Config = DEFAULT) -> 
 
 @jax.jit
 def _criticise(
-    params: Motion3DGANReference, tangent: Array, log_length: Array, start: ArrayLike, end: ArrayLike
-) -> Array:
+    params: Motion3DGANReference,
+    tangent: Float[Array | np.ndarray, "steps L 3"],
+    log_length: ArrayLike,
+    start: ArrayLike,
+    end: ArrayLike,
+) -> Float[Array, ""]:
     """Return the critic's score () of a tangent vector at p (T-1, L, 3) and a log-length (), for two label indices."""
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     condition = _one_hots(chart, start, end)
-    image = tangent.reshape(len(tangent), -1).T[..., None]
+    image = jnp.asarray(tangent).reshape(len(tangent), -1).T[..., None]
     for kernel in weights["convs"]:
         image = _tile(_leaky(_convolve(image, kernel, stride=2)), condition)
     standard = (log_length - chart.scalar_mean[start, end, 0]) / chart.scalar_std[0]
@@ -127,7 +134,7 @@ def sample(
     key: Array,
     start: ArrayLike,
     end: ArrayLike,
-    pose: Float[Array, " D"] | None = None,
+    pose: Float[Array | np.ndarray, " D"] | None = None,
 ) -> Motion:
     """Draw a motion between two labels. The pose is ignored, and the duration is the mean of the label pair."""
     del pose

@@ -54,7 +54,9 @@ def fit(poses: Float[np.ndarray, "M D"], labels: Int[np.ndarray, " M"], *, class
 
 
 @jax.jit
-def clip_to_distribution(params: StartPoses, pose: Float[Array, " D"], label: ArrayLike) -> Float[Array, " D"]:
+def clip_to_distribution(
+    params: StartPoses, pose: Float[Array | np.ndarray, " D"], label: ArrayLike
+) -> Float[Array, " D"]:
     """Clip a pose to `LIMIT` standard deviations along each principal axis of the label's peaks.
 
     In a chain of transitions the end of each deviates slightly from a real peak. Components along axes without variance

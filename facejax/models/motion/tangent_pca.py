@@ -57,7 +57,7 @@ class TangentPCA(NamedTuple):
 
 def fit(
     p: Float[np.ndarray, "steps L 3"],
-    tangents: Float[np.ndarray, "M steps L 3"],
+    tangents: Float[np.ndarray, "M ..."],  # looser than (M, steps, L, 3): other shapes get the error below
     motion: Motion,
     start: Int[np.ndarray, " M"],
     end: Int[np.ndarray, " M"],

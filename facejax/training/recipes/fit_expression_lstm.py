@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.typing import ArrayLike
 
 from facejax import losses
 from facejax.data import sequences
-from facejax.models import expression_lstm
+from facejax.models import expression_lstm, lstm
 from facejax.training import loop, metric_logger, steps
 
 FEEDS = ("truth", "coin", "switch")
@@ -51,7 +52,7 @@ PAPER = ExpressionPlan(steps=10_000, final_rate=1.0, feed="truth", next_step=1.0
 
 def fit(
     data: sequences.Sequences,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     labels: dict[str, int],
     plan: ExpressionPlan = ExpressionPlan(),
@@ -109,7 +110,9 @@ def network(params: expression_lstm.ExpressionLSTM, number: int) -> expression_l
     return jax.tree.map(lambda leaf: leaf[number], params)
 
 
-def _batches(rows: dict[str, np.ndarray], labels: dict[str, int], batch: int, seed: int) -> Callable:
+def _batches(
+    rows: dict[str, np.ndarray], labels: dict[str, int], batch: int, seed: int
+) -> Callable[[int, int], tuple[np.ndarray, np.ndarray]]:
     """Return `batches(first, count)`: (steps done (count, E), rows of the block (count, E, B))."""
     orders = {name: loop.epoch_indices(1000 * seed + labels[name], len(rows[name]), batch) for name in labels}
 
@@ -121,8 +124,10 @@ def _batches(rows: dict[str, np.ndarray], labels: dict[str, int], batch: int, se
     return batches
 
 
-def _loss(plan: ExpressionPlan, config: expression_lstm.Config) -> Callable:
-    def loss(weights, key, batch, constants):
+def _loss(plan: ExpressionPlan, config: expression_lstm.Config) -> steps.Loss:
+    def loss(
+        weights: lstm.Weights, key: jax.Array, batch: loop.Tree, constants: loop.Tree
+    ) -> tuple[ArrayLike, loop.Metrics]:
         (done, which), ((scale, strength), block) = batch, constants
         inputs, target, mask, neutral = (field[which] for field in block)
         noise_key, feed_key = jax.random.split(key)
@@ -161,7 +166,15 @@ def _given(key: jax.Array, shape: tuple[int, int], share: jax.Array, feed: str) 
     return jnp.arange(size) < frame
 
 
-def _claim(folder, data, block, labels, plan, config, seed) -> None:
+def _claim(
+    folder: str | os.PathLike[str],
+    data: sequences.Sequences,
+    block: sequences.Block,
+    labels: dict[str, int],
+    plan: ExpressionPlan,
+    config: expression_lstm.Config,
+    seed: int,
+) -> None:
     arrays = (block.targets, block.mask, block.neutral, data.label)
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
     what = {"plan": plan._asdict(), "config": config._asdict(), "labels": labels, "seed": seed, "recordings": digest}

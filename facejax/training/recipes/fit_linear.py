@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from facejax.data.mesh_subset import MeshSubset
 from facejax.models.decoders import linear
 
@@ -10,7 +12,7 @@ FOLDS = 4
 
 
 def fit_linear(
-    model: linear.Model, train: MeshSubset, *, by: str = "subjects", **options
+    model: linear.Model, train: MeshSubset, *, by: str = "subjects", **options: Any
 ) -> tuple[linear.LinearMap, float]:
     """Fit ridge, PCA or a dictionary; returns the map and the chosen regularisation.
 

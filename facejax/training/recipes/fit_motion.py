@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,13 @@ from jax.sharding import Mesh
 from facejax import losses
 from facejax.data import motions, transitions
 from facejax.geometry import sphere, srvf
+from facejax.models import layers
 from facejax.models.motion import flow_matching, motion3dgan, motion3dgan_reference, tangent_pca
 from facejax.training import loop, metric_logger, steps
+
+Config = TypeVar("Config", motion3dgan.Config, flow_matching.Config)
+Pair = tuple[jax.Array, jax.Array]  # indices of the start and end labels
+Condition = tuple[jax.Array, jax.Array, jax.Array]  # start, end and pose
 
 
 class GanPlan(NamedTuple):
@@ -55,7 +61,7 @@ class FlowPlan(NamedTuple):
 def fit_gan(
     examples: transitions.Examples,
     chart: tangent_pca.TangentPCA,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: GanPlan = GanPlan(),
     config: motion3dgan.Config = motion3dgan.Config(),
@@ -104,7 +110,7 @@ def fit_gan(
 def fit_flow(
     examples: transitions.Examples,
     chart: tangent_pca.TangentPCA,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: FlowPlan = FlowPlan(),
     config: flow_matching.Config = flow_matching.Config(),
@@ -121,7 +127,9 @@ def fit_flow(
     init_key, run_key = jax.random.split(jax.random.key(seed))
     weights = flow_matching.init(init_key, chart, config=config).weights
 
-    def loss(weights, key, batch, chart):
+    def loss(
+        weights: layers.Weights, key: jax.Array, batch: tuple[jax.Array, Condition], chart: tangent_pca.TangentPCA
+    ) -> tuple[jax.Array, loop.Metrics]:
         values, condition = batch
         source_key, time_key = jax.random.split(key)
         keys = jax.random.split(source_key, len(values))
@@ -133,7 +141,7 @@ def fit_flow(
         unit = size * unit**plan.whitening
         params = flow_matching.FlowMatching(chart, weights)
 
-        def field(state, time, condition):
+        def field(state: flow_matching.State, time: jax.Array, condition: Condition) -> flow_matching.State:
             return flow_matching.velocity(params, state, time, *condition)
 
         return losses.flow_matching(field, time_key, source, target, condition, unit), {}
@@ -148,7 +156,7 @@ def fit_flow(
 def fit_reference(
     known: motions.Motions,
     chart: tangent_pca.TangentPCA,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: GanPlan = REFERENCE,
     config: motion3dgan_reference.Config = motion3dgan_reference.Config(),
@@ -170,10 +178,12 @@ def fit_reference(
     )
     optimisers = steps.Players(optax.adam(plan.rate, 0.5, 0.9), optax.adam(plan.rate, 0.5, 0.9))
 
-    def scalars(chart, pair):
+    def scalars(chart: tangent_pca.TangentPCA, pair: Pair) -> tuple[jax.Array, jax.Array]:
         return chart.scalar_mean[*pair, 0], chart.scalar_std[0]
 
-    def generate(weights, chart, key, pair):
+    def generate(
+        weights: layers.Weights, chart: tangent_pca.TangentPCA, key: jax.Array, pair: Pair
+    ) -> dict[str, jax.Array]:
         params = motion3dgan_reference.Motion3DGANReference(chart, weights)
         tangent, log_length = motion3dgan_reference.generator.apply(
             params, jax.random.normal(key, (config.noise,)), *pair
@@ -183,12 +193,16 @@ def fit_reference(
         mean, deviation = scalars(chart, pair)
         return {"tangent": tangent, "length": (log_length - mean) / deviation}
 
-    def score(weights, chart, sample, pair):
+    def score(
+        weights: layers.Weights, chart: tangent_pca.TangentPCA, sample: dict[str, jax.Array], pair: Pair
+    ) -> jax.Array:
         mean, deviation = scalars(chart, pair)
         params = motion3dgan_reference.Motion3DGANReference(chart, weights)
         return motion3dgan_reference.critic.apply(params, sample["tangent"], mean + deviation * sample["length"], *pair)
 
-    def terms(chart, fake, real, pair):
+    def terms(
+        chart: tangent_pca.TangentPCA, fake: dict[str, jax.Array], real: dict[str, jax.Array], pair: Pair
+    ) -> loop.Metrics:
         length = chart.scalar_std[0] * losses.tangent_l1(fake["length"], real["length"])
         return {
             "reconstruction": plan.reconstruction * losses.tangent_l1(fake["tangent"], real["tangent"]),
@@ -212,7 +226,17 @@ def fit_reference(
     return motion3dgan_reference.Motion3DGANReference(chart, state.extra)
 
 
-def _run(step, state, examples: transitions.Examples, chart, folder, count: int, batch: int, seed: int, device_mesh):
+def _run(
+    step: loop.Step,
+    state: loop.TrainState,
+    examples: transitions.Examples,
+    chart: tangent_pca.TangentPCA,
+    folder: str | os.PathLike[str],
+    count: int,
+    batch: int,
+    seed: int,
+    device_mesh: Mesh | None,
+) -> loop.TrainState:
     rows = transitions.balance_pairs(examples.start, examples.end, seed)
     order = loop.epoch_indices(seed, len(rows), batch)
     conditions = tuple(jnp.asarray(x) for x in (examples.start, examples.end, examples.pose))
@@ -228,13 +252,20 @@ def _run(step, state, examples: transitions.Examples, chart, folder, count: int,
     )
 
 
-def config_for_chart(config, chart: tangent_pca.TangentPCA):
+def config_for_chart(config: Config, chart: tangent_pca.TangentPCA) -> Config:
     """Return a network's config with the sizes of the chart."""
     (rank, steps, landmarks, _), labels, pose = chart.basis.shape, len(chart.mean), len(chart.pose_scale)
     return config._replace(rank=rank, steps=steps, landmarks=landmarks, labels=labels, pose=pose)
 
 
-def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> None:
+def _claim(
+    folder: str | os.PathLike[str],
+    kind: str,
+    plan: GanPlan | FlowPlan,
+    config: motion3dgan.Config | motion3dgan_reference.Config | flow_matching.Config,
+    seed: int,
+    known: np.ndarray,
+) -> None:
     if plan.steps < 1:
         raise ValueError(f"plan: expected 1 step or more, got {plan.steps}")
     digest = hashlib.sha256(np.ascontiguousarray(known).data).hexdigest()
@@ -242,8 +273,10 @@ def _claim(folder, kind: str, plan, config, seed: int, known: np.ndarray) -> Non
     metric_logger.claim_folder(folder, record)
 
 
-def _terms(plan: GanPlan):
-    def terms(chart, fake, real, condition):
+def _terms(
+    plan: GanPlan,
+) -> Callable[[tangent_pca.TangentPCA, jax.Array, jax.Array, Condition], loop.Metrics]:
+    def terms(chart: tangent_pca.TangentPCA, fake: jax.Array, real: jax.Array, condition: Condition) -> loop.Metrics:
         # Equation 6 on tangent vectors, which are linear in the coordinates.
         difference = jnp.tensordot((fake - real)[:, tangent_pca.SCALARS :], chart.basis, 1)
         scalars = chart.scalar_std * jnp.mean(jnp.abs((fake - real)[:, : tangent_pca.SCALARS]), axis=0)

@@ -16,6 +16,7 @@ from facejax import losses
 from facejax.data.mesh_subset import MeshSubset
 from facejax.mesh.hierarchy import Hierarchy
 from facejax.mesh.stencils import Stencil
+from facejax.models import layers
 from facejax.models.decoders import neural3dmm, s2d_dec
 from facejax.training import loop, metric_logger, steps
 from facejax.training.recipes import fit_s2d_dec
@@ -44,7 +45,7 @@ class FittedNeural3DMM(NamedTuple):
 def fit(
     train: MeshSubset,
     hierarchy: Hierarchy,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: Neural3DMMPlan = Neural3DMMPlan(),
     seed: int = 0,
@@ -70,7 +71,9 @@ def fit(
     down = jax.device_put(neural3dmm.downsampling_spirals(hierarchy))
     hierarchy = jax.device_put(hierarchy)
 
-    def loss(trained, key, batch, constants):
+    def loss(
+        trained: layers.Weights, key: jax.Array, batch: loop.Tree, constants: loop.Tree
+    ) -> tuple[jax.Array, loop.Metrics]:
         scale, hierarchy, down, weights, neutrals = constants
         marks, target, owner = batch
         rest = neutrals[owner]

@@ -22,6 +22,7 @@ from facejax.data.mesh_subset import MeshSubset
 from facejax.io import weights
 from facejax.mesh import strain
 from facejax.mesh.hierarchy import Hierarchy
+from facejax.models import layers
 from facejax.models.decoders import gpmm, gpmm_residual, residual
 from facejax.training import loop, metric_logger, sharding, steps
 from facejax.training.recipes import fit_gpmm
@@ -44,7 +45,7 @@ class ResidualPlan(NamedTuple):
 def fit(
     train: MeshSubset,
     hierarchy: Hierarchy,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: ResidualPlan = ResidualPlan(),
     by: str = "subjects",
@@ -78,7 +79,9 @@ def fit(
     init_key, run_key = jax.random.split(jax.random.key(seed))
     params = residual.init(init_key, hierarchy, scale)
 
-    def loss(trained, key, batch, constants):
+    def loss(
+        trained: layers.Weights, key: jax.Array, batch: loop.Tree, constants: loop.Tree
+    ) -> tuple[jax.Array, loop.Metrics]:
         scale, hierarchy, tables, neutrals = constants
         marks, start, target, owner = batch
         found = residual.apply(

@@ -20,6 +20,7 @@ from jax.sharding import Mesh
 from facejax import losses
 from facejax.data.mesh_subset import MeshSubset
 from facejax.mesh.hierarchy import Hierarchy
+from facejax.models import layers
 from facejax.models.decoders import s2d_dec
 from facejax.training import loop, metric_logger, steps
 
@@ -40,7 +41,7 @@ class S2DDecPlan(NamedTuple):
 def fit(
     meshes: MeshSubset,
     hierarchy: Hierarchy,
-    folder: str | os.PathLike,
+    folder: str | os.PathLike[str],
     *,
     plan: S2DDecPlan = S2DDecPlan(),
     seed: int = 0,
@@ -57,7 +58,9 @@ def fit(
     scale = s2d_dec.measure(meshes)
     params = s2d_dec.init(init_key, hierarchy, landmarks=len(data.landmark_index), scale=scale)
 
-    def loss(trained, key, batch, constants):
+    def loss(
+        trained: layers.Weights, key: jax.Array, batch: loop.Tree, constants: loop.Tree
+    ) -> tuple[jax.Array, loop.Metrics]:
         scale, hierarchy, weights = constants
         marks, target = batch
         predicted = s2d_dec.apply(s2d_dec.S2DDec(scale, trained), hierarchy, marks)

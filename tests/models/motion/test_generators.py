@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -60,10 +61,11 @@ def test_steps_of_integration_are_the_flows(made):
     assert float(sphere.distance(few.q, many.q)) > 1e-4
 
 
-def test_wrong_requests_are_named(made):
+def test_wrong_requests_are_named(made, monkeypatch):
     with pytest.raises(TypeError, match=r"parameters of a generator.*got dict"):
         generators.kind(made)
-    with pytest.raises(TypeError, match="got tuple"):
+    with monkeypatch.context() as patch, pytest.raises(TypeError, match="got tuple"):
+        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # what a caller gets: only tests check types
         generators.sample((1, 2), KEY, 0, 1, POSE)
     for steps in (0, -1):
         with pytest.raises(ValueError, match=f"1 or more, got {steps}"):
