@@ -51,7 +51,7 @@ class Config(_measure.Options):
 def run(config: Config) -> _measure.Found:
     """Measure and return the rows."""
     models = pipeline.load()
-    spiral = models._replace(decoder=s2d_dec.init(jax.random.key(0), models.hierarchy))
+    spiral = models.replace(decoder=s2d_dec.init(jax.random.key(0), models.hierarchy))
     ways = {"": (models, {}), "_linear": (models, {"refined": False}), "_s2d": (spiral, {})}
     rows, repeats = [], 5 if config.quick else 15
     for way, (of, options) in ways.items():

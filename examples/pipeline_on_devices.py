@@ -48,7 +48,7 @@ def main(out: Path | None = None, steps: int = 60, seed: int = 0) -> dict[str, f
     jax.config.update("jax_num_cpu_devices", 4)  # before any computation: JAX opens its devices once
     out = Path(tempfile.mkdtemp(prefix="recogniser-")) if out is None else out
     released = facejax.load()
-    numbers = jnp.asarray(pipeline.label_indices(released, LABELS))
+    numbers = jnp.asarray(released.labels.encode(LABELS))
     rest = released.face.vertices[released.face.landmark_index]
     # Computed once for a face, on the host: its linear map from landmarks to vertices, of which 50 are used.
     whole = gpmm.linear_map(released.decoder.base, released.face.vertices)

@@ -177,9 +177,9 @@ def _about(name: str, model: Any, options: baselines.Options) -> dict[str, Any]:
     if isinstance(model, baselines.LinearFit):
         return {"alpha_mm2": model.alpha}
     if name in ("gpmm", "gpmm_found"):
-        return model.params.prior._asdict()
+        return dataclasses.asdict(model.params.prior)
     if name == "s2d_residual":
-        return {**model.base.prior._asdict(), "gate": float(model.network.gate), "steps": options.residual.steps}
+        return {**dataclasses.asdict(model.base.prior), "gate": float(model.network.gate), "steps": options.residual.steps}
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 

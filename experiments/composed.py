@@ -147,7 +147,7 @@ def _joints(models: pipeline.Models, key, labels, drawn: np.ndarray, scale: floa
         bend = np.linalg.norm(np.diff(curves, n=2, axis=1), axis=-1).mean(axis=-1)
         return float(bend[:, at].mean() / np.delete(bend, at, axis=1).mean())
 
-    pairs = composition.label_pairs(pipeline.label_indices(models, labels))
+    pairs = composition.label_pairs(models.labels.encode(labels))
     keys = composition.sample_keys(key, len(drawn))
     curves = scale * np.asarray(composition.draw(models.motion, models.starts, keys, pairs).curves)
     gaps = np.abs(curves[:, 1:, 0] - curves[:, :-1, -1]).max()

@@ -190,7 +190,7 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
     # Of the training steps alone, over all runs: compilation and preparation are the same for all variants.
     seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in metric_logger.read(folder))
     about = {"variant": name, "seed": seed, "seconds": seconds}
-    pipeline.save(path, models._replace(about=models.about | about))
+    pipeline.save(path, models.replace(about=models.about | about))
 
 
 def _judge(config: Config):

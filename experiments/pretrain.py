@@ -94,7 +94,7 @@ def run(config: Config) -> dict[str, Any]:
     seconds = motion_seconds + decoder_seconds
     made = _run.record(config, seconds=seconds, dataset=data.index["spec"])
     models = pipeline.Models(
-        labels=_names(config, data),
+        labels=bundle.Labels(_names(config, data)),
         face=pipeline.Face(
             shape.vertices,
             shape.faces,
@@ -106,7 +106,9 @@ def run(config: Config) -> dict[str, Any]:
         starts=beginnings,
         hierarchy=hierarchy,
         decoder=decode,
-        about={"made": made, "plans": {"motion": _motion_about(config), "decoder": _decoder_about(config)}},
+        about=bundle.Provenance(
+            {"made": made, "plans": {"motion": _motion_about(config), "decoder": _decoder_about(config)}}
+        ),
     )
     # Evaluated as saved: the file holds rounded weights.
     pipeline.save(config.out / bundle.RELEASED, models)
@@ -115,7 +117,7 @@ def run(config: Config) -> dict[str, Any]:
         "error_mm": vertex_error.model_errors(models, data, "test"),
         "seconds": {"motion": motion_seconds, "decoder": decoder_seconds},
     }
-    models = models._replace(about=models.about | metrics)
+    models = models.replace(about=models.about | metrics)
     pipeline.save(config.out / bundle.RELEASED, models)
     if config.release:
         pipeline.save(PACKAGED, models)

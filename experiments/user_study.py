@@ -164,7 +164,7 @@ def plan(config: Config, models: dict[str, pipeline.Models]) -> list[Item]:
     others = [item._replace(kind="predecessor") for item in ours if "predecessor" in models]
     real = [item._replace(kind="real") for item in ours[: config.real]]
     for item in others:
-        pipeline.label_indices(models["predecessor"], item.labels)
+        models["predecessor"].labels.encode(item.labels)
     for item in real:
         if item.labels[1] not in expression_recipes.EXPRESSIONS:
             raise ValueError(f"real: the dataset has no {item.labels[1]!r}; go without with --real 0")

@@ -14,6 +14,7 @@ from typing import Any
 from facejax.cli import labels
 from facejax.cli.arguments import Animate, Data, Demo, Fit, Generate, Labels, MakeHuman, Prepare, Register, View
 from facejax.inference import checks
+from facejax.models import labels as label_names
 
 MAX_PEOPLE = 1000  # of a corpus, or of sample faces
 MAX_FRAMES = 100_000  # of all samples together
@@ -236,8 +237,8 @@ def _check_labels(names: Sequence[str], model: Path | None) -> None:
     """Check the labels of a motion, and the model file, by the file's metadata; no labels are drawn later."""
     known = labels.read_labels(model)
     if names:
-        checks.check_transitions(names)
-        checks.check_labels(names, known)
+        label_names.check_transitions(names)
+        label_names.check_labels(names, known)
 
 
 def _check_mesh(path: Path | None) -> None:

@@ -43,8 +43,9 @@ def animate_subjects(out: Path, *, seed: int = 7) -> Path:
     rows, marks, names, shown = [], [], [person.name for person in people], np.zeros(0, int)
     with outputs.progress("demo", 3 * len(people) + 2) as advance:
         for person, key in zip(people, keys, strict=True):
-            moved = pipeline.landmarks(models, key, LABELS, person.vertices)
-            vertices = np.asarray(jax.block_until_ready(pipeline.meshes(models, moved, person.vertices)))
+            face = pipeline.prepare(models, person.vertices)
+            moved = pipeline.motion(models, key, models.labels.encode(LABELS), face)
+            vertices = np.asarray(pipeline.vertices(models, face, moved))
             clock.lap("labels to meshes" if marks else "labels to meshes, first (compiles, or reads the cache)")
             marks.append(np.asarray(moved))
             scene = outputs.scene_of(models, person.vertices, vertices, marks[-1], LABELS, pipeline.FRAMES)

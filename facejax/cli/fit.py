@@ -57,6 +57,6 @@ def fit(
     models = fit_bundle.fit(found, out.with_suffix(".training"), plans=plans, seed=seed, device_mesh=device_mesh)
     errors = vertex_error.model_errors(models, found)
     if sharding.is_primary():
-        pipeline.save(out, models._replace(about=models.about | {"error_mm": errors}))
+        pipeline.save(out, models.replace(about=models.about | {"error_mm": errors}))
     sharding.barrier("the models are written")
     return out, errors

@@ -60,22 +60,23 @@ def generate(
     """
     runtime.configure()
     models = pipeline.load(model)
-    pipeline.label_indices(models, labels)
+    models.labels.encode(labels)
     if bound is not None and not np.array_equal(models.face.faces, assets.load().faces):
         raise ValueError(f"{model}: expected MakeHuman's topology, which scans are registered to")
     if isinstance(frames, str):
         if frames != motion_sources.NATURAL:
             raise ValueError(f"frames: expected a number or {motion_sources.NATURAL!r}, got {frames!r}")
         frames = pipeline.durations(models, jax.random.key(seed), labels, rate=fps)
-    checks.check_total_frames(samples, pipeline.lengths(labels, frames))
+    checks.check_total_frames(samples, pipeline.lengths(len(labels) - 1, frames))
     landmarks = pipeline.landmarks(
         models, jax.random.key(seed), labels, neutral, samples=samples, frames=frames, intensity=intensity
     )
     outputs.make_output_folder(out)
+    face = pipeline.prepare(models, neutral)
     written, name = [], outputs.file_stem(labels) if bound is None else f"{bound.name}-{outputs.file_stem(labels)}"
     with outputs.progress("writing", samples * len(formats) + 1) as advance:
         for i, marks in enumerate(np.asarray(landmarks)):
-            vertices = np.asarray(pipeline.meshes(models, marks, neutral))
+            vertices = np.asarray(pipeline.vertices(models, face, marks))
             stem = name if samples == 1 else f"{name}-{i + 1}"
             if bound is None:
                 scene = outputs.scene_of(models, neutral, vertices, marks, labels, frames)

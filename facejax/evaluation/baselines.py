@@ -34,7 +34,7 @@ from facejax.data.mesh_subset import MeshSubset
 from facejax.geometry import rbf
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.mesh import rbf_weights
-from facejax.models.decoders import dictionary, gpmm, gpmm_residual, linear, s2d_dec
+from facejax.models.decoders import dictionary, gpmm, gpmm_fit, gpmm_residual, linear, s2d_dec
 from facejax.training.recipes import fit_gpmm, fit_linear, fit_neural3dmm, fit_residual, fit_s2d_dec
 
 
@@ -46,7 +46,7 @@ class Options(NamedTuple):
     decoder: fit_s2d_dec.S2DDecPlan = fit_s2d_dec.S2DDecPlan()
     residual: fit_residual.ResidualPlan = fit_residual.ResidualPlan()
     neural3dmm: fit_neural3dmm.Neural3DMMPlan = fit_neural3dmm.Neural3DMMPlan()
-    components: int = gpmm.COMPONENTS
+    components: int = gpmm_fit.COMPONENTS
     base: fit_gpmm.FittedGPMM | None = None  # of the residual decoder, if it has been fitted already
     hierarchy: mesh_hierarchy.Hierarchy | None = None  # of the spiral networks; default: built from the mean face
 
@@ -148,8 +148,9 @@ def _apply_gpmm(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral:
 
 
 def _apply_gpmm_with_noise(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
+    known = gpmm.on_face(fitted.params, neutral)
     params = gpmm.with_landmark_noise(
-        fitted.params, gpmm.estimate_landmark_noise(fitted.params, neutral, displacements)
+        fitted.params, gpmm.estimate_landmark_noise(fitted.params, known, displacements)
     )
     return neutral + np.asarray(linear.apply(gpmm.linear_map(params, neutral), displacements))
 
@@ -162,7 +163,7 @@ def _fit_residual(train: MeshSubset, folder: Path, options: Options) -> gpmm_res
 
 
 def _apply_residual(fitted: gpmm_residual.GPMMResidual, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
-    return neutral + np.asarray(gpmm_residual.apply(fitted, displacements, neutral))
+    return neutral + np.asarray(gpmm_residual.apply(fitted, gpmm_residual.prepare(fitted, neutral), displacements))
 
 
 def _fit_neural(train: MeshSubset, folder: Path, options: Options) -> fit_neural3dmm.FittedNeural3DMM:

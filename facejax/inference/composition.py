@@ -75,7 +75,7 @@ def label_pairs(labels: Sequence[int] | np.ndarray, *, classes: int | None = Non
     if numbers.ndim != 1 or len(numbers) < 2:
         raise ValueError(f"labels: expected at least a start and an end, got {numbers.tolist()}")
     if numbers.dtype.kind not in "iu":
-        raise ValueError(f"labels: expected indices, got {numbers.tolist()}; `pipeline.label_indices` converts names")
+        raise ValueError(f"labels: expected indices, got {numbers.tolist()}; `models.labels.encode` converts names")
     outside = np.flatnonzero((numbers < 0) | (numbers >= (np.inf if classes is None else classes)))
     if outside.size:
         last = "" if classes is None else f" to {classes - 1}"

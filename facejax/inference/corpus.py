@@ -103,12 +103,12 @@ def _plan(models: pipeline.Models, request: Request, neutrals: dict[str, np.ndar
     for neutral in neutrals.values():
         pipeline.neutral_landmarks(models, neutral)
     if request.labels:
-        numbers = pipeline.label_indices(models, request.labels)
+        numbers = models.labels.encode(request.labels)
         pairs = np.asarray(composition.label_pairs(numbers, classes=len(models.labels)))[None]
     else:
         known = range(len(models.labels))
         pairs = np.array([[(a, b)] for a in known for b in known if a != b], np.int32)
-    total = 1 + pairs.shape[1] * (pipeline.lengths(("", ""), request.frames)[0] - 1)
+    total = 1 + pairs.shape[1] * (pipeline.lengths(1, request.frames)[0] - 1)
     points = len(models.face.landmark_index) + (len(models.face.vertices) if request.meshes else 0)
     sequence_bytes = total * points * 12  # float32
     size = max(1, SHARD_BYTES // sequence_bytes) if request.shard is None else request.shard
@@ -198,11 +198,11 @@ def _meshes(models: pipeline.Models, marks: np.ndarray, person: np.ndarray, neut
     """Decode vertices (S, T, N, 3), person by person."""
     made = np.empty((*marks.shape[:2], *neutrals[0].shape), np.float32)
     for who in np.unique(person):
-        rows = np.flatnonzero(person == who)
+        rows, face = np.flatnonzero(person == who), pipeline.prepare(models, neutrals[who])
         for low in range(0, len(rows), MESH_BATCH):
             chosen = rows[low : low + MESH_BATCH]
             padding = np.repeat(chosen[-1:], MESH_BATCH - len(chosen))  # one compiled program for all
-            found = pipeline.meshes(models, jnp.asarray(marks[np.append(chosen, padding)]), neutrals[who])
+            found = pipeline.vertices(models, face, marks[np.append(chosen, padding)])
             made[chosen] = np.asarray(found)[: len(chosen)]
     return made
 

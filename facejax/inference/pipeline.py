@@ -1,65 +1,213 @@
 """Inference: from labels and a neutral face to landmarks and meshes.
 
     models = pipeline.load()
-    landmarks = pipeline.landmarks(models, key, ["neutral", "high_smile", "neutral"], neutral)
-    vertices = pipeline.meshes(models, landmarks, neutral)
+    face = pipeline.prepare(models, neutral)
+    labels = models.labels.encode(["neutral", "high_smile", "neutral"])
+    landmarks = pipeline.motion(models, key, labels, face)
+    vertices = pipeline.vertices(models, face, landmarks)
 
-T frames, N vertices, L landmarks, S samples; millimetres. A neutral face is (N, 3) vertices in the models' topology.
+`prepare`, `motion` and `vertices` are pure functions of pytrees: `jit`, `vmap`, `grad`, `scan` and `shard_map` go
+through them in any order, with models and face as arguments. `landmarks` and `meshes` do the same from names of labels
+and the vertices of a face, in one call each.
+
+T frames, N vertices, L landmarks, S samples, K labels; millimetres. A neutral face is (N, 3) vertices in the models'
+topology.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
 from facejax.inference import checks, composition
-from facejax.mesh.hierarchy import Hierarchy
-from facejax.models.bundle import Face, Models, load, save
+from facejax.models import labels as label_names
+from facejax.models.bundle import Face, Labels, Models, Provenance, load, save
 from facejax.models.decoders import gpmm_residual, s2d_dec
 
 __all__ = [
     "FRAMES",
     "RATE",
     "Face",
+    "Labels",
     "Models",
+    "PreparedFace",
+    "Provenance",
     "captions",
     "displacements",
     "durations",
-    "label_indices",
     "landmarks",
     "lengths",
     "load",
     "meshes",
+    "motion",
     "neutral_landmarks",
+    "prepare",
     "save",
+    "vertices",
 ]
 
 RATE = 30.0  # frames per second of generated motions
 FRAMES = 30  # of a transition, as in the generator's training data
 
 
+class PreparedFace(struct.PyTreeNode):
+    """What the models need of one neutral face, computed once by `prepare`."""
+
+    neutral: Float[Array, "N 3"]  # mm
+    landmarks: Float[Array, "L 3"]  # at rest, mm
+    size: Float[Array, ""]  # norm of the centred landmarks, mm: the unit of generated displacements
+    decoder: gpmm_residual.PreparedFace | None  # None for S2D-Dec, which does not use the face
+
+
+def prepare(models: Models, neutral: Float[Array | np.ndarray, "N 3"]) -> PreparedFace:
+    """Prepare a neutral face (N, 3), in mm, in the dtype of its vertices.
+
+    Traceable and differentiable in the neutral face; `vmap` prepares many faces. With the GPMM it factorises a dense
+    N x N system: about 100 MB of memory per face of 3,260 vertices.
+
+    Raises:
+      ValueError: another vertex count, or (outside of tracing) a size that is not a head's in millimetres.
+    """
+    neutral_landmarks(models, neutral)
+    return _prepare(models, neutral)
+
+
+@jax.jit
+def _prepare(models: Models, neutral: Float[Array | np.ndarray, "N 3"]) -> PreparedFace:
+    neutral = _floating(neutral)
+    marks = neutral[jnp.asarray(models.face.landmark_index)]
+    size = jnp.sqrt(jnp.sum((marks - marks.mean(axis=0)) ** 2))
+    carried = isinstance(models.decoder, gpmm_residual.GPMMResidual)
+    return PreparedFace(neutral, marks, size, gpmm_residual.prepare(models.decoder, neutral) if carried else None)
+
+
+def motion(
+    models: Models,
+    key: Array,
+    labels: Int[Array | np.ndarray, "*lead K"],
+    face: PreparedFace,
+    *,
+    frames: int | Sequence[int] = FRAMES,
+    intensity: ArrayLike = 1.0,
+) -> Float[Array, "*lead T L 3"]:
+    """Generate the landmark motion through label indices: (..., T, L, 3) in mm.
+
+    Args:
+      key: one key, which is split for leading axes of `labels`; or keys of those axes.
+      labels: (..., K) indices, K >= 2, from `models.labels.encode`. A motion that does not start at neutral starts at a
+        peak drawn from `models.starts`. Traced labels are not checked.
+      frames: the length of every transition, or one for each; static. T = 1 + sum of (frames - 1), joints are not
+        repeated. `durations` gives natural ones.
+      intensity: scale of all displacements from neutral, 0 to 2; may be traced.
+
+    Raises:
+      ValueError: labels that are out of range or repeat, or an option out of range.
+    """
+    if np.ndim(labels) < 1 or not jnp.issubdtype(jnp.result_type(labels), jnp.integer):
+        raise ValueError("labels: expected indices (..., K); `models.labels.encode` converts names")
+    if not isinstance(labels, Tracer):
+        for row in np.reshape(np.asarray(labels), (-1, np.shape(labels)[-1])):
+            composition.label_pairs(row, classes=len(models.labels))
+    if isinstance(intensity, float | int):
+        checks.check_intensity(intensity)
+    each = lengths(np.shape(labels)[-1] - 1, frames)
+    return _motion(models, key, labels, face, intensity, frames=each)
+
+
+@partial(jax.jit, static_argnames="frames")
+def _motion(
+    models: Models, key: Array, labels: Array, face: PreparedFace, intensity: ArrayLike, *, frames: tuple[int, ...]
+) -> Array:
+    labels = jnp.asarray(labels)
+    lead = labels.shape[:-1]
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.wrap_key_data(key)
+    keys = key if key.shape == lead else jax.random.split(key, lead)
+
+    def one(key: Array, labels: Array) -> Array:
+        pairs = jnp.stack([labels[:-1], labels[1:]], axis=-1)
+        drawn = composition.draw(models.motion, models.starts, key[None], pairs)
+        matrix = composition.timeline(frames, drawn=drawn.curves.shape[2])
+        return composition.join(drawn.curves, jnp.asarray(matrix, drawn.curves.dtype))[0]
+
+    flat = jax.vmap(one)(keys.reshape(-1), labels.reshape(-1, labels.shape[-1])) if lead else one(keys, labels)
+    unitless = flat.reshape(*lead, *flat.shape[-3:])
+    return face.landmarks + intensity * face.size * unitless
+
+
+def vertices(
+    models: Models,
+    face: PreparedFace,
+    landmarks: Float[Array | np.ndarray, "... L 3"],
+    *,
+    refined: bool = True,
+    noise: ArrayLike | None = 0.0,
+) -> Float[Array, "... N 3"]:
+    """Decode landmarks (..., L, 3) of a prepared face to vertices (..., N, 3); mm.
+
+    Args:
+      refined: False returns the GPMM estimate without the residual decoder: much faster, little worse; static.
+      noise: standard deviation of the landmarks in mm, such as a detector's; None estimates it; may be traced. See
+        `gpmm_residual.apply`.
+
+    Raises:
+      ValueError: another landmark count, or `noise` for an S2D-Dec, which does not support it.
+    """
+    if landmarks.shape[-2:] != face.landmarks.shape[-2:]:
+        raise ValueError(f"landmarks: expected (..., {face.landmarks.shape[-2]}, 3), got {landmarks.shape}")
+    exact = isinstance(noise, float | int) and noise == 0
+    if face.decoder is None and not exact:
+        raise ValueError("noise is not supported by S2D-Dec; use a GPMM decoder (`models.decoders.gpmm_residual`)")
+    if noise is not None and isinstance(noise, float | int) and not noise >= 0:
+        raise ValueError(f"noise: expected 0 mm or more, got {noise}")
+    if noise is None and not isinstance(landmarks, Tracer) and not np.isfinite(landmarks).all():
+        raise ValueError("landmarks: expected finite numbers to estimate their noise from")
+    return _vertices(models, face, landmarks, 0.0 if exact else noise, refined=refined, exact=exact)
+
+
+@partial(jax.jit, static_argnames=("refined", "exact"))
+def _vertices(
+    models: Models,
+    face: PreparedFace,
+    landmarks: Array | np.ndarray,
+    noise: ArrayLike | None,
+    *,
+    refined: bool,
+    exact: bool,
+) -> Array:
+    moved = jnp.asarray(landmarks, face.neutral.dtype) - face.landmarks
+    if isinstance(models.decoder, gpmm_residual.GPMMResidual):
+        assert face.decoder is not None
+        noise = 0.0 if exact else noise
+        return face.neutral + gpmm_residual.apply(models.decoder, face.decoder, moved, refined=refined, noise=noise)
+    return face.neutral + s2d_dec.apply(models.decoder, models.hierarchy, moved)
+
+
 def landmarks(
     models: Models,
-    key: jax.Array,
+    key: Array,
     labels: Sequence[str],
-    neutral: np.ndarray | jax.Array,
+    neutral: Float[Array | np.ndarray, "N 3"],
     *,
     samples: int | None = None,
     frames: int | Sequence[int] = FRAMES,
     intensity: float = 1.0,
-) -> jax.Array:
+) -> Array:
     """Generate the landmark motion through `labels`: (T, L, 3), or (S, T, L, 3) with `samples`; mm.
 
     Args:
-      labels: two or more names; a motion that does not start at neutral starts at a peak drawn from `models.starts`.
+      labels: two or more names; otherwise as in `motion`.
       neutral: (N, 3) vertices; mm.
-      frames: the length of every transition, or one for each; T = 1 + sum of (frames - 1), joints are not repeated.
-        `durations` gives natural ones.
-      intensity: scale of all displacements from neutral, 0 to 2.
+      frames, intensity: as in `motion`.
 
     Raises:
       ValueError: an unknown label, another vertex count, or an option out of range.
@@ -72,15 +220,15 @@ def landmarks(
 
 
 def displacements(
-    models: Models, key: jax.Array, labels: Sequence[str], *, samples: int, frames: int | Sequence[int] = FRAMES
-) -> jax.Array:
+    models: Models, key: Array, labels: Sequence[str], *, samples: int, frames: int | Sequence[int] = FRAMES
+) -> Array:
     """Generate displacements from neutral (S, T, L, 3), unitless: divided by the norm of the centred landmarks."""
-    numbers = _numbers(models, labels)
-    each = lengths(labels, frames)
-    return composition.compose(models.motion, models.starts, key, numbers, samples=samples, frames=each)
+    numbers = _encode(models, labels)
+    each = lengths(len(labels) - 1, frames)
+    return composition.compose(models.motion, models.starts, key, numbers.tolist(), samples=samples, frames=each)
 
 
-def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: float = RATE) -> tuple[int, ...]:
+def durations(models: Models, key: Array, labels: Sequence[str], *, rate: float = RATE) -> tuple[int, ...]:
     """Generate the natural number of frames of each transition at `rate` frames per second.
 
     Natural is what the training data has: in makehuman4d an onset is a random draw of 18 to 39 frames at 60 frames per
@@ -90,19 +238,18 @@ def durations(models: Models, key: jax.Array, labels: Sequence[str], *, rate: fl
     """
     if not rate > 0:
         raise ValueError(f"rate must be above 0 frames per second, got {rate}")
-    pairs = composition.label_pairs(_numbers(models, labels))
+    pairs = composition.label_pairs(_encode(models, labels))
     drawn = composition.draw(models.motion, models.starts, composition.sample_keys(key, 1), pairs)
     seconds = np.exp(np.asarray(drawn.log_seconds[0]))
     return tuple(max(2, 1 + round(float(x) * rate)) for x in seconds)
 
 
-def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ...]:
-    """Return the frames of each transition. Raises `ValueError` for a wrong count or fewer than two frames."""
-    count = len(labels) - 1
+def lengths(transitions: int, frames: int | Sequence[int]) -> tuple[int, ...]:
+    """Return the frames of each of some transitions. Raises `ValueError` for a wrong count or fewer than two frames."""
     values = np.asarray(frames)
-    found = [values.item()] * count if values.ndim == 0 else values.tolist()
-    if len(found) != count:
-        raise ValueError(f"frames: expected one number, or {count} for {count} transitions, got {len(found)}")
+    found: list[Any] = [values.item()] * transitions if values.ndim == 0 else values.tolist()
+    if len(found) != transitions:
+        raise ValueError(f"frames: expected one number, or {transitions} for {transitions} transitions, got {len(found)}")
     if any(n != int(n) or n < 2 for n in found):
         raise ValueError(f"frames: expected whole numbers of 2 or more, got {frames}")
     return tuple(int(n) for n in found)
@@ -110,73 +257,55 @@ def lengths(labels: Sequence[str], frames: int | Sequence[int]) -> tuple[int, ..
 
 def meshes(
     models: Models,
-    landmarks: np.ndarray | jax.Array,
-    neutral: np.ndarray | jax.Array,
+    landmarks: Float[Array | np.ndarray, "... L 3"],
+    neutral: Float[Array | np.ndarray, "N 3"],
     *,
     refined: bool = True,
     noise: float | None = 0.0,
-) -> jax.Array:
+) -> Array:
     """Decode landmarks (..., T, L, 3) of a face with neutral vertices (N, 3) to vertices (..., T, N, 3); mm.
 
-    Args:
-      refined: False returns the GPMM estimate without the residual decoder: much faster, little worse.
-      noise: standard deviation of the landmarks in mm, such as a detector's; None estimates it. See
-        `gpmm_residual.apply`.
+    Prepares the face in every call: with several motions of one face, call `prepare` once and then `vertices`.
 
     Raises:
-      ValueError: another vertex or landmark count, or `noise` for an S2D-Dec, which does not support it.
+      ValueError: as `prepare` and `vertices`.
     """
-    rest = neutral_landmarks(models, neutral)
-    if landmarks.shape[-2:] != rest.shape:
-        raise ValueError(f"landmarks: expected (..., {rest.shape[0]}, 3), got {landmarks.shape}")
-    if isinstance(models.decoder, gpmm_residual.GPMMResidual):
-        return jnp.asarray(neutral, jnp.float32) + gpmm_residual.apply(
-            models.decoder, landmarks - rest, neutral, refined=refined, noise=noise
-        )
-    if noise != 0:
-        raise ValueError("noise is not supported by S2D-Dec; use a GPMM decoder (`models.decoders.gpmm_residual`)")
-    return _decode(models.decoder, models.hierarchy, landmarks - rest, jnp.asarray(neutral, jnp.float32))
+    return vertices(models, prepare(models, neutral), landmarks, refined=refined, noise=noise)
 
 
 def captions(labels: Sequence[str], *, frames: int | Sequence[int] = FRAMES) -> tuple[tuple[int, str], ...]:
     """Return (first frame, "neutral → high_smile") of each transition."""
-    begins = np.cumsum([0] + [count - 1 for count in lengths(labels, frames)])
+    begins = np.cumsum([0] + [count - 1 for count in lengths(len(labels) - 1, frames)])
     pairs = zip(labels[:-1], labels[1:], strict=True)
     return tuple((int(begin), f"{start} → {end}") for begin, (start, end) in zip(begins, pairs, strict=False))
 
 
-def neutral_landmarks(models: Models, neutral: np.ndarray | jax.Array) -> jax.Array:
+def neutral_landmarks(models: Models, neutral: Float[Array | np.ndarray, "N 3"]) -> Float[Array, "L 3"]:
     """Return the landmarks (L, 3) of a neutral face (N, 3); mm.
 
-    Raises `ValueError` for another vertex count, or a size that is not a head's in millimetres.
+    Raises `ValueError` for another vertex count, or (outside of tracing) a size that is not a head's in millimetres.
     """
     expected = models.face.vertices.shape
     if np.shape(neutral) != expected:
         raise ValueError(f"neutral: expected vertices {expected} in the models' topology, got {np.shape(neutral)}")
-    if not isinstance(neutral, Tracer):
+    if not isinstance(neutral, Tracer) and not isinstance(models.face.vertices, Tracer):
         size, usual = (
-            np.linalg.norm(np.ptp(np.asarray(x)[models.face.landmark_index], axis=0))
+            np.linalg.norm(np.ptp(np.asarray(x)[np.asarray(models.face.landmark_index)], axis=0))
             for x in (neutral, models.face.vertices)
         )
         if not usual / 3 < size < 3 * usual:
             raise ValueError(
                 f"neutral: its landmarks span {size:.4g}, expected about {usual:.0f} mm: give vertices in millimetres"
             )
-    return jnp.asarray(neutral, jnp.float32)[models.face.landmark_index]
+    return _floating(neutral)[jnp.asarray(models.face.landmark_index)]
 
 
-def label_indices(models: Models, labels: Sequence[str]) -> np.ndarray:
-    """Return the indices (K,) of label names. Raises `ValueError` for an unknown name, with the closest ones."""
-    checks.check_labels(labels, models.labels)
-    return np.array([models.labels.index(name) for name in labels], np.int32)
-
-
-def _numbers(models: Models, labels: Sequence[str]) -> list[int]:
+def _encode(models: Models, labels: Sequence[str]) -> np.ndarray:
     """Return the indices of two or more labels, no two in a row alike."""
-    checks.check_transitions(labels)
-    return label_indices(models, labels).tolist()
+    label_names.check_transitions(labels)
+    return models.labels.encode(labels)
 
 
-@jax.jit
-def _decode(params: s2d_dec.S2DDec, hierarchy: Hierarchy, displacements: jax.Array, neutral: jax.Array) -> jax.Array:
-    return neutral + s2d_dec.apply(params, hierarchy, displacements)
+def _floating(values: Array | np.ndarray) -> Array:
+    """Return values in their own floating dtype; float32 for integers, and for float64 without x64."""
+    return jnp.asarray(values, jnp.result_type(jnp.asarray(values), jnp.float32))

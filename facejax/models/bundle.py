@@ -9,44 +9,78 @@ N vertices, F triangles, L landmarks; millimetres.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import traverse_util
+from flax import struct, traverse_util
 
 from facejax.io import weights
 from facejax.mesh import hierarchy as mesh_hierarchy
 from facejax.models.decoders import gpmm_residual, s2d_dec
+from facejax.models.labels import Labels
 from facejax.models.motion import generators, start_poses, tangent_pca
+from facejax.models.records import Leaf
 
 RELEASED = "makehuman4d.safetensors"
 S2D, REFINED = "s2d", "refined"  # values of "decoder" in a file's metadata: S2D-Dec, or GPMM and residual decoder
 COMPONENTS = 200  # of the GPMM in a file; twice as many gain 0.001 mm and add 4 MB
 
 
-class Face(NamedTuple):
+class Provenance(Mapping[str, Any]):
+    """Where weights come from: command, commit, dataset, errors.
+
+    All provenances are equal, so that models that differ in nothing else share their compiled functions.
+    """
+
+    def __init__(self, fields: Mapping[str, Any] = {}):  # noqa: B006  copied
+        self._fields = dict(fields)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._fields[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    def __or__(self, other: Mapping[str, Any]) -> Provenance:
+        return Provenance({**self, **other})
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Provenance)
+
+    def __hash__(self) -> int:
+        return hash(Provenance)
+
+    def __repr__(self) -> str:
+        return f"Provenance({self._fields})"
+
+
+class Face(struct.PyTreeNode):
     """The mesh topology that the models were trained on."""
 
-    vertices: np.ndarray  # (N, 3) the mean neutral face of the population, mm
-    faces: np.ndarray  # (F, 3) triangles
-    landmark_index: np.ndarray  # (L,) vertices
-    source_index: np.ndarray  # (N,) vertices of MakeHuman's body; empty for another topology
-    mask: np.ndarray  # (N,) bool, the face region
+    vertices: Leaf  # (N, 3) the mean neutral face of the population, mm
+    faces: Leaf  # (F, 3) triangles
+    landmark_index: Leaf  # (L,) vertices
+    source_index: Leaf  # (N,) vertices of MakeHuman's body; empty for another topology
+    mask: Leaf  # (N,) bool, the face region
 
 
-class Models(NamedTuple):
-    """All models that inference needs."""
+class Models(struct.PyTreeNode):
+    """All models that inference needs: a pytree of arrays, an argument of compiled functions."""
 
-    labels: tuple[str, ...]  # neutral first
     face: Face
     motion: generators.Generator
     starts: start_poses.StartPoses  # distribution of the poses from which a motion starts
     hierarchy: mesh_hierarchy.Hierarchy
     decoder: s2d_dec.S2DDec | gpmm_residual.GPMMResidual  # S2D-Dec, or GPMM estimate plus residual decoder
-    about: dict[str, Any]  # provenance of the weights
+    labels: Labels = struct.field(pytree_node=False)
+    about: Provenance = struct.field(pytree_node=False, default=Provenance())
 
 
 def load(path: str | os.PathLike[str] | None = None) -> Models:
@@ -73,13 +107,13 @@ def load(path: str | os.PathLike[str] | None = None) -> Models:
     networks = ["motion", "starts", "hierarchy"]
     networks += ["decoder"] if isinstance(tree["decoder"], s2d_dec.S2DDec) else []
     moved = {name: jax.tree.map(jnp.asarray, tree[name]) for name in networks}
-    return Models(labels=tuple(about["labels"]), about=about, **tree | moved)
+    return Models(labels=Labels(about["labels"]), about=Provenance(about), **tree | moved)
 
 
 def save(path: str | os.PathLike[str], models: Models) -> None:
     """Write models to one safetensors file, with the metadata that `load` needs."""
-    tree = models._asdict()
-    about = tree.pop("about") | {"labels": list(tree.pop("labels")), "generator": generators.kind(models.motion)}
+    tree: dict[str, Any] = {name: getattr(models, name) for name in ("face", "motion", "starts", "hierarchy", "decoder")}
+    about = {**models.about, "labels": list(models.labels), "generator": generators.kind(models.motion)}
     about["decoder"] = S2D
     tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)
     if isinstance(models.decoder, gpmm_residual.GPMMResidual):

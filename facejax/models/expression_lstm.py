@@ -170,15 +170,16 @@ def generate(
     known = 1 if prefix is None else prefix.shape[-3]
     if frames < 2 or known > frames or known < 1:
         raise ValueError(f"frames: expected 2 or more, and {known} for the prefix; got {frames}")
-    steps = jnp.zeros((*lead, frames - 1, *shape))
+    dtype = params.scale.neutral_mean.dtype
+    steps = jnp.zeros((*lead, frames - 1, *shape), dtype)
     if prefix is not None:
         _check(params, prefix, "prefix")
         # Entry t holds the step that led to frame t, as in a training block.
-        steps = steps.at[..., 1:known, :, :].set(jnp.diff(prefix, axis=-3)[..., : frames - 2, :, :])
+        steps = steps.at[..., 1:known, :, :].set(jnp.diff(jnp.asarray(prefix, dtype), axis=-3)[..., : frames - 2, :, :])
     made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
     if prefix is not None:
-        made = made.at[..., : known - 1, :, :].set(jnp.diff(prefix, axis=-3))
-    curve = jnp.cumsum(jnp.concatenate([jnp.zeros((*lead, 1, *shape)), made], axis=-3), axis=-3)
+        made = made.at[..., : known - 1, :, :].set(jnp.diff(jnp.asarray(prefix, dtype), axis=-3))
+    curve = jnp.cumsum(jnp.concatenate([jnp.zeros((*lead, 1, *shape), dtype), made], axis=-3), axis=-3)
     last = jnp.where(stop > 0, expression_length(curve, fraction=stop), frames) - 1
     place = jnp.minimum(jnp.arange(frames), last[..., None])
     return jnp.take_along_axis(curve, place[..., None, None], axis=-3)

@@ -77,7 +77,7 @@ def test_meshes_unrefined_and_of_a_detectors_landmarks(models, person):
 def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):
     params = s2d_dec.init(jax.random.key(0), models.hierarchy)
     path = tmp_path / "s2d.safetensors"
-    pipeline.save(path, models._replace(decoder=params))
+    pipeline.save(path, models.replace(decoder=params))
     again = pipeline.load(path)
     assert again.about["decoder"] == bundle.S2D and isinstance(again.decoder, s2d_dec.S2DDec)
     marks = pipeline.landmarks(again, KEY, ["neutral", "anger"], person.vertices, frames=3)
@@ -211,7 +211,7 @@ def test_a_file_keeps_its_kind_of_generator(models, tmp_path):
         }
     for kind, generator in others.items():
         path = tmp_path / f"{kind}.safetensors"
-        pipeline.save(path, models._replace(motion=generator))
+        pipeline.save(path, models.replace(motion=generator))
         again = pipeline.load(path)
         assert generators.kind(again.motion) == again.about["generator"] == kind
         assert jax.tree.structure(again.motion) == jax.tree.structure(generator)

@@ -9,167 +9,174 @@ landmark displacements with noise of variance `noise` is an affine map. It diffe
 Noisy landmarks, such as a detector's, degrade the estimate strongly; set their noise with `with_landmark_noise`, or
 estimate it with `estimate_landmark_noise`.
 
-    params = gpmm.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
-    face_map = gpmm.linear_map(params, neutral)  # once per face, 0.2 s
+    params = gpmm_fit.fit(people, faces, landmark_index, prior=gpmm.Prior(carried=True, smooth=0.01, noise=1e-4))
+    face_map = gpmm.linear_map(params, neutral)  # once per face
     displacements = linear.apply(face_map, landmark_displacements)
+
+Covariances are never formed: they are held as a root S with S.T @ S the covariance, whose condition number is the square
+root of the covariance's, so that float32 suffices (within 2e-4 mm of float64 on makehuman4d).
 
 On makehuman4d's level 3, validation people, training on 80: the mean vertex error over the head is 0.0432 mm for ridge
 regression and 0.0205 mm for this model. Expressions of that level are themselves made by deformation transfer, which
 favours the model; those of levels 0 and 1 are not.
 
-N vertices, F triangles, L landmarks, k components, T frames of a person; millimetres, on the host, in float64.
+N vertices, L landmarks, k components; millimetres. Functions work in the dtype of the neutral face, and are pure: they
+compile, vectorise over faces, and differentiate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from facejax.mesh import deformation_transfer
 from facejax.models.decoders import linear
+from facejax.models.records import Leaf, Number
 
-COMPONENTS = 400
+HIGHEST = jax.lax.Precision.HIGHEST
 SMOOTH_SCALES_MM = (10.0, 20.0, 40.0, 80.0)  # of the smooth prior: wrinkles, cheek, jaw, head
 NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # steps of 6 %
 
 
-class Person(NamedTuple):
-    """One neutral face and T frames of displacements from it."""
-
-    neutral: np.ndarray  # (N, 3)
-    landmarks: np.ndarray  # (T, L, 3)
-    vertices: np.ndarray  # (T, N, 3)
-
-
-class Prior(NamedTuple):
+class Prior(struct.PyTreeNode):
     """Hyperparameters; chosen by cross-validation (`facejax.training.recipes.fit_gpmm`)."""
 
-    carried: bool = True  # whether the learned covariance is transferred to each face
-    smooth: float = 0.003  # standard deviation of the smooth prior, in units of each vertex's `motion`
-    noise: float = 1e-4  # variance of a landmark coordinate, mm^2
+    # Whether the learned covariance is transferred to each face.
+    carried: bool = struct.field(pytree_node=False, default=True)
+    smooth: Number = 0.003  # standard deviation of the smooth prior, in units of each vertex's `motion`
+    noise: Number = 1e-4  # variance of a landmark coordinate, mm^2
 
 
-class GPMM(NamedTuple):
+class GPMM(struct.PyTreeNode):
     """The mean face and the statistics of displacements on it."""
 
-    faces: np.ndarray  # (F, 3)
-    landmark_index: np.ndarray  # (L,)
-    face: np.ndarray  # (N, 3)
-    motion: np.ndarray  # (N,) root mean square displacement of each vertex in mm, which scales the smooth prior
-    hold: np.ndarray  # (N,) `motion` as used by the deformation transfer's anchors
-    # Carried: a basis on the mean face. Otherwise moments, or the map itself (from a file), the same for all faces.
-    statistics: linear.Basis | linear.Moments | linear.LinearMap
+    tables: deformation_transfer.TransferTables  # of the triangles
+    landmark_index: Leaf  # (L,)
+    face: Leaf  # (N, 3)
+    motion: Leaf  # (N,) root mean square displacement of each vertex in mm, scales the smooth prior
+    hold: Leaf  # (N,) `motion` as used by the deformation transfer's anchors
+    mean: Leaf  # (N, 3) mean displacement
+    components: Leaf  # (k, N, 3); the covariance is the sum of variance * component * component
+    variance: Leaf  # (k,) mm^2
+    smooth_root: Leaf  # (L, L), of the smooth prior with unit `smooth` between landmarks
+    smooth_cross: Leaf  # (L, N); smooth_root.T @ smooth_cross is that of landmarks and vertices
     prior: Prior
+    # The map without landmark noise where it is the same for all faces: a model that is not carried.
+    shared_map: linear.LinearMap | None = None
+
+    @property
+    def faces(self) -> Leaf:
+        """The triangles (F, 3)."""
+        return self.tables.faces
 
 
-def fit(
-    people: Iterable[Person],
+class FaceStatistics(NamedTuple):
+    """The model's statistics on one face."""
+
+    mean: Float[Array, "N 3"]
+    root: Float[Array, "k N 3"]  # components times their standard deviations
+
+
+def build(
     faces: Int[np.ndarray, "F 3"],
     landmark_index: Int[np.ndarray, " L"],
     *,
-    prior: Prior = Prior(),
-    components: int = COMPONENTS,
-    passes: int = 3,
-) -> GPMM:
-    """Fit the model to people, any iterable that can be iterated several times.
-
-    Args:
-      faces: (F, 3) triangles.
-      landmark_index: (L,) vertices.
-      components: of the basis, if `prior.carried`.
-      passes: of the subspace iteration.
-
-    Raises:
-      ValueError: no person with a frame.
-    """
-    face, motion = mean_face_and_motion(people)
-    statistics = fit_statistics(
-        [(p.landmarks, transfer_to(p, faces, face, motion) if prior.carried else p.vertices) for p in people],
-        carried=prior.carried, components=components, passes=passes,
-    )  # fmt: skip
-    return GPMM(faces, landmark_index, face, motion, motion, statistics, prior)
-
-
-def mean_face_and_motion(people: Iterable[Person]) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
-    """Return the mean face (N, 3), and the root mean square displacement of its vertices over all frames (N,), in mm.
-
-    Raises:
-      ValueError: no person with a frame.
-    """
-    count, faces, frames, squares = 0, np.zeros(()), 0, np.zeros(())
-    for person in people:
-        count, faces = count + 1, faces + np.asarray(person.neutral, np.float64)
-        frames += len(person.vertices)
-        squares = squares + np.sum(np.square(person.vertices, dtype=np.float64), axis=(0, 2))
-    if not frames:
-        raise ValueError("expected at least one person with a frame, got none")
-    return faces / count, np.sqrt(squares / frames)
-
-
-def fit_statistics(
-    batches: linear.Batches, *, carried: bool, components: int = COMPONENTS, passes: int = 3
-) -> linear.Basis | linear.Moments:
-    """Fit the statistics of displacements: a PCA basis if they were transferred to the mean face, else moments."""
-    return (
-        linear.pca.prepare(batches, components=components, passes=passes) if carried else linear.ridge.prepare(batches)
-    )
-
-
-def transfer_to(
-    person: Person,
-    faces: Int[np.ndarray, "F 3"],
     face: Float[np.ndarray, "N 3"],
     motion: Float[np.ndarray, " N"],
-) -> Float[np.ndarray, "T N 3"]:
-    """Transfer a person's displacements to another face, in float32; `motion` as in `GPMM`."""
-    anchors = deformation_transfer.anchor_weights(motion)
-    there = deformation_transfer.DeformationTransfer(person.neutral, face, faces, anchors)
-    back = deformation_transfer.DeformationTransfer(face, person.neutral, faces, anchors)
-    return deformation_transfer.invert(there, back, person.vertices).astype(np.float32)
+    hold: Float[np.ndarray, " N"],
+    mean: Float[np.ndarray, "N 3"],
+    components: Float[np.ndarray, "k N 3"],
+    variance: Float[np.ndarray, " k"],
+    prior: Prior,
+    shared_map: linear.LinearMap | None = None,
+) -> GPMM:
+    """Return a model with the tables that depend only on its mean face; on the host. Fields as in `GPMM`."""
+    kernel = smooth_kernel(face, landmark_index, motion)
+    variances, directions = np.linalg.eigh(kernel[:, landmark_index])
+    # Directions without variance cannot move; their inverse root would be noise.
+    kept = variances > 1e-10 * max(variances[-1], 1e-300)
+    root = np.sqrt(np.where(kept, variances, 0))
+    cross = (directions.T @ kernel) * np.where(kept, 1 / np.where(kept, root, 1), 0)[:, None]
+    tables = deformation_transfer.transfer_tables(faces, len(face))
+    return GPMM(
+        tables, landmark_index, face, motion, hold, mean, components, variance, root[:, None] * directions.T, cross,
+        prior, shared_map,
+    )  # fmt: skip
 
 
-def with_landmark_noise(params: GPMM, noise: float) -> GPMM:
+def smooth_kernel(
+    face: Float[np.ndarray, "N 3"], landmark_index: Int[np.ndarray, " L"], motion: Float[np.ndarray, " N"]
+) -> Float[np.ndarray, "L N"]:
+    """Return the smooth prior's covariance of landmarks and vertices, for a standard deviation of `motion`."""
+    squared = np.sum((face[landmark_index, None] - face) ** 2, axis=-1)
+    kernel = np.mean([np.exp(-squared / (2 * scale**2)) for scale in SMOOTH_SCALES_MM], axis=0)
+    return kernel * motion[landmark_index, None] * motion
+
+
+def with_landmark_noise(params: GPMM, noise: ArrayLike) -> GPMM:
     """Return the model with landmark noise sigma (mm) per coordinate, added to the prior's noise.
 
     Raises:
       ValueError: negative noise, or a model that holds only the linear map.
     """
-    if not noise >= 0:
-        raise ValueError(f"noise: expected 0 mm or more, got {noise}")
-    if noise and isinstance(params.statistics, linear.LinearMap):
+    if isinstance(noise, float | int):
+        if not noise >= 0:
+            raise ValueError(f"noise: expected 0 mm or more, got {noise}")
+        if noise == 0:
+            return params
+    if not len(params.components):
         raise ValueError(
             "noise: this model file stores only a linear map fitted to noise-free landmarks; expected noise 0"
         )
-    return params._replace(prior=params.prior._replace(noise=params.prior.noise + noise**2))
+    return params.replace(prior=params.prior.replace(noise=params.prior.noise + noise**2), shared_map=None)
 
 
-def estimate_landmark_noise(
-    params: GPMM, neutral: Float[Array | np.ndarray, "N 3"], landmarks: Float[Array | np.ndarray, "T L 3"]
-) -> float:
-    """Estimate the noise of one face's landmark displacements: sigma in mm per coordinate.
-
-    The value of `NOISE_GRID_MM` (at most 5 mm) that maximises the marginal likelihood of all frames (type II maximum
-    likelihood).
+@jax.jit
+def on_face(params: GPMM, neutral: Float[Array | np.ndarray, "N 3"]) -> FaceStatistics:
+    """Return the statistics on a face: transferred to it, if the model is carried.
 
     Raises:
-      ValueError: no frames, values that are not finite, or errors of `linear_map` and `with_landmark_noise`.
+      ValueError: a face of another shape.
     """
-    if len(landmarks) == 0 or not np.isfinite(landmarks).all():
-        raise ValueError(f"landmarks: expected one or more frames of finite numbers, got {np.shape(landmarks)}")
-    if isinstance(params.statistics, linear.LinearMap):
-        raise ValueError(
-            "noise: this model file stores only a linear map, without the statistics to estimate landmark noise from"
-        )
-    known = covariances(params, neutral, vertex_index=np.zeros(0, int))
-    variance, directions = np.linalg.eigh(_posterior(known, params.prior)[0])
-    centred = (np.asarray(landmarks) - known.landmark_mean).reshape(len(landmarks), -1)
-    observed = np.mean(np.square(centred @ directions), axis=0)
-    expected = np.maximum(variance, params.prior.noise) + np.square(NOISE_GRID_MM)[:, None]
-    likelihood = -np.sum(np.log(expected) + observed / expected, axis=1)
-    return float(NOISE_GRID_MM[np.argmax(likelihood)])
+    if np.shape(neutral) != np.shape(params.face):
+        raise ValueError(f"neutral: expected vertices {np.shape(params.face)}, got {np.shape(neutral)}")
+    dtype = jnp.result_type(jnp.asarray(neutral), jnp.float32)
+    mean, components, variance = (
+        jnp.asarray(x, dtype) for x in (params.mean, params.components, params.variance)
+    )
+    if params.prior.carried and len(components):
+        anchors = deformation_transfer.anchor_weights(params.hold)
+        fields = jnp.concatenate([mean[None], components])
+        moved = deformation_transfer.transfer(params.face, jnp.asarray(neutral, dtype), params.tables, anchors, fields)
+        mean, components = moved[0], moved[1:]
+    return FaceStatistics(mean, components * jnp.sqrt(variance)[:, None, None])
+
+
+@jax.jit
+def posterior_map(params: GPMM, known: FaceStatistics) -> linear.LinearMap:
+    """Return the affine map of a face from its statistics, for `linear.apply`.
+
+    With the joint root (S, F) of landmarks and vertices and S = Q R, the map is (S.T S)^-1 S.T F = R^-1 Q.T F.
+    """
+    if params.shared_map is not None:
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, known.mean.dtype), params.shared_map)
+    dtype, at, smooth = known.mean.dtype, jnp.asarray(params.landmark_index), params.prior.smooth
+    count, marks = len(known.root), len(at)
+    orthonormal, triangle = jnp.linalg.qr(
+        jnp.concatenate([_landmark_root(params, known), jnp.sqrt(params.prior.noise) * jnp.eye(3 * marks, dtype=dtype)])
+    )
+    learned = jnp.einsum("kj,knx->jnx", orthonormal[:count], known.root, precision=HIGHEST)
+    rows = orthonormal[count : count + 3 * marks].reshape(marks, 3, 3 * marks)
+    cross = smooth * jnp.asarray(params.smooth_cross, dtype)
+    right = learned + jnp.einsum("rxj,rn->jnx", rows, cross, precision=HIGHEST)
+    solved = jax.scipy.linalg.solve_triangular(triangle, right.reshape(3 * marks, -1))
+    return linear.LinearMap(known.mean[at], known.mean, (solved,))
 
 
 def linear_map(params: GPMM, neutral: Float[Array | np.ndarray, "N 3"]) -> linear.LinearMap:
@@ -178,87 +185,39 @@ def linear_map(params: GPMM, neutral: Float[Array | np.ndarray, "N 3"]) -> linea
     Raises:
       ValueError: a face of another shape.
     """
-    if isinstance(params.statistics, linear.LinearMap):
-        _check(params, neutral)
-        return params.statistics
-    within, cross = _posterior(known := covariances(params, neutral), params.prior)
-    return linear.affine(known.mean[params.landmark_index], known.mean, np.linalg.solve(within, cross))
+    return posterior_map(params, on_face(params, neutral))
 
 
-class Covariances(NamedTuple):
-    """Covariances of V vertices and the landmarks of one face, before the prior's weights are applied."""
+@jax.jit
+def estimate_landmark_noise(
+    params: GPMM, known: FaceStatistics, landmarks: Float[Array | np.ndarray, "T L 3"]
+) -> Float[Array, ""]:
+    """Estimate the noise of one face's landmark displacements: sigma in mm per coordinate.
 
-    mean: np.ndarray  # (V, 3)
-    landmark_mean: np.ndarray  # (L, 3)
-    within: np.ndarray  # (3 L, 3 L) learned, between landmarks
-    cross: np.ndarray  # (3 L, 3 V) learned, between landmarks and vertices
-    smooth_within: np.ndarray  # (3 L, 3 L) of the smooth prior with unit `smooth`
-    smooth_cross: np.ndarray  # (3 L, 3 V)
-
-
-def covariances(
-    params: GPMM, neutral: Float[Array | np.ndarray, "N 3"], *, vertex_index: Int[np.ndarray, " V"] | None = None
-) -> Covariances:
-    """Return the covariances of one face's landmarks with all vertices, or with those of `vertex_index`.
+    The value of `NOISE_GRID_MM` (at most 5 mm) that maximises the marginal likelihood of all frames (type II maximum
+    likelihood). Frames that are not finite give an arbitrary value.
 
     Raises:
-      ValueError: a face of another shape.
+      ValueError: no frames, or a model that holds only the linear map.
     """
-    _check(params, neutral)
-    at = params.landmark_index
-    index = np.arange(len(params.face)) if vertex_index is None else vertex_index
-    mean, within, cross = _learned(params, neutral, index)
-    smooth = _smooth(params)
-    smooth_within, smooth_cross = (np.kron(smooth[:, columns], np.eye(3)) for columns in (at, index))
-    return Covariances(mean[index], mean[at], within, cross, smooth_within, smooth_cross)
+    if len(landmarks) == 0:
+        raise ValueError(f"landmarks: expected one or more frames, got {np.shape(landmarks)}")
+    if not len(params.components):
+        raise ValueError(
+            "noise: this model file stores only a linear map, without the statistics to estimate landmark noise from"
+        )
+    root = _landmark_root(params, known)
+    _, deviation, directions = jnp.linalg.svd(root, full_matrices=False)
+    centred = (jnp.asarray(landmarks) - known.mean[jnp.asarray(params.landmark_index)]).reshape(len(landmarks), -1)
+    observed = jnp.mean(jnp.square(jnp.matmul(centred, directions.T, precision=HIGHEST)), axis=0)
+    grid = jnp.asarray(NOISE_GRID_MM, root.dtype)
+    expected = deviation**2 + params.prior.noise + jnp.square(grid)[:, None]
+    likelihood = -jnp.sum(jnp.log(expected) + observed / expected, axis=1)
+    return grid[jnp.argmax(likelihood)]
 
 
-def predict(
-    known: Covariances, prior: Prior, landmarks: Float[Array | np.ndarray, "T L 3"]
-) -> Float[np.ndarray, "T V 3"]:
-    """Return the displacements (T, V, 3) given the landmarks'; for a few frames cheaper than `linear_map`."""
-    within, cross = _posterior(known, prior)
-    centred = np.asarray(landmarks - known.landmark_mean).reshape(len(landmarks), -1)
-    return known.mean + (np.linalg.solve(within, centred.T).T @ cross).reshape(len(landmarks), -1, 3)
-
-
-def _check(params: GPMM, neutral: Array | np.ndarray) -> None:
-    if np.shape(neutral) != params.face.shape:
-        raise ValueError(f"neutral: expected vertices {params.face.shape}, got {np.shape(neutral)}")
-
-
-def _posterior(known: Covariances, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
-    """Return the landmarks' covariance with noise, and that of landmarks and vertices, under a prior."""
-    weight = prior.smooth**2
-    within = known.within + weight * known.smooth_within + prior.noise * np.eye(len(known.within))
-    return within, known.cross + weight * known.smooth_cross
-
-
-def _learned(
-    params: GPMM, neutral: Array | np.ndarray, vertex_index: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, on this face, the mean (N, 3), the covariance between landmarks, and that with the chosen vertices."""
-    statistics, at = params.statistics, params.landmark_index
-    if isinstance(statistics, linear.Moments):
-        cross = statistics.cross.reshape(len(statistics.cross), -1, 3)[:, vertex_index]
-        return statistics.vertex_mean, statistics.covariance, cross.reshape(len(cross), -1)
-    if isinstance(statistics, linear.LinearMap):
-        raise ValueError("this model file stores only a linear map, without covariances")
-    anchors = deformation_transfer.anchor_weights(params.hold)
-    transfer = deformation_transfer.DeformationTransfer(params.face, np.asarray(neutral), params.faces, anchors)
-    components = statistics.components.reshape(-1, *params.face.shape)
-    moved = transfer(np.concatenate([statistics.vertex_mean[None], components]))
-    mean, moved = moved[0], moved[1:]
-    marks = moved[:, at].reshape(len(moved), -1)
-    weighted = statistics.variance[:, None] * marks
-    return mean, weighted.T @ marks, weighted.T @ moved[:, vertex_index].reshape(len(moved), -1)
-
-
-def _smooth(params: GPMM) -> np.ndarray:
-    """Return the smooth prior's covariance of landmarks and vertices, (L, N), for a standard deviation of `motion`."""
-    at = params.landmark_index
-    squared = np.sum((params.face[at, None] - params.face) ** 2, axis=-1)
-    kernel = np.zeros_like(squared)
-    for scale in SMOOTH_SCALES_MM:
-        kernel = kernel + np.exp(-squared / (2 * scale**2))
-    return kernel / len(SMOOTH_SCALES_MM) * params.motion[at, None] * params.motion
+def _landmark_root(params: GPMM, known: FaceStatistics) -> Float[Array, "rows coordinates"]:
+    """Return the root (k + 3 L, 3 L) of the landmarks' covariance without noise."""
+    learned = known.root[:, jnp.asarray(params.landmark_index)].reshape(len(known.root), -1)
+    smooth = params.prior.smooth * jnp.asarray(params.smooth_root, known.mean.dtype)
+    return jnp.concatenate([learned, jnp.kron(smooth, jnp.eye(3, dtype=smooth.dtype))])

@@ -1,25 +1,23 @@
 """GPMM estimate plus residual decoder: from the landmarks of one face to its mesh.
 
-    vertices = neutral + gpmm_residual.apply(params, landmark_displacements, neutral)
+    face = gpmm_residual.prepare(params, neutral)  # once per face
+    vertices = neutral + gpmm_residual.apply(params, face, landmark_displacements)
 
-The linear map of a face is computed once on the host (0.2 s) and cached for the last few faces. `pack` and `unpack`
-convert the parameters for files.
+`pack` and `unpack` convert the parameters for files.
 
 N vertices, L landmarks, B samples, k components; millimetres.
 """
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import math
-from collections import OrderedDict
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from flax import struct
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from facejax.mesh import strain
@@ -27,12 +25,9 @@ from facejax.mesh.hierarchy import Hierarchy
 from facejax.models.decoders import gpmm, linear, residual
 
 BATCH = 16
-CACHE_SIZE = 8  # faces whose linear map is kept
-# Model and linear map of a face, by the model's identity, the face's digest and the noise; least recently used first.
-_cache: OrderedDict[tuple[int, str, float], tuple[gpmm.GPMM, linear.LinearMap]] = OrderedDict()
 
 
-class GPMMResidual(NamedTuple):
+class GPMMResidual(struct.PyTreeNode):
     """The GPMM, the residual decoder, and the index tables of the mesh."""
 
     base: gpmm.GPMM
@@ -41,85 +36,90 @@ class GPMMResidual(NamedTuple):
     tables: strain.VertexTriangles
 
 
+class PreparedFace(NamedTuple):
+    """What the decoder needs of one neutral face."""
+
+    neutral: Float[Array, "N 3"]
+    statistics: gpmm.FaceStatistics
+    map: linear.LinearMap  # without landmark noise
+
+
+@jax.jit
+def prepare(params: GPMMResidual, neutral: Float[Array | np.ndarray, "N 3"]) -> PreparedFace:
+    """Prepare a neutral face.
+
+    Raises:
+      ValueError: a face of another shape.
+    """
+    known = gpmm.on_face(params.base, neutral)
+    return PreparedFace(jnp.asarray(neutral, known.mean.dtype), known, gpmm.posterior_map(params.base, known))
+
+
 def apply(
     params: GPMMResidual,
+    face: PreparedFace,
     displacements: Float[Array | np.ndarray, "... L 3"],
-    neutral: Float[Array | np.ndarray, "N 3"],
     *,
     refined: bool = True,
-    noise: float | None = 0.0,
+    noise: ArrayLike | None = 0.0,
 ) -> Float[Array, "... N 3"]:
-    """Return vertex displacements of one face from its landmark displacements.
+    """Return vertex displacements of a prepared face from its landmark displacements.
 
     Args:
       refined: add the residual decoder's output; without it the GPMM estimate alone, one matrix product.
       noise: landmark noise sigma (mm) per coordinate, such as a detector's; None estimates it from the frames
-        (`gpmm.estimate_landmark_noise`). With noise the GPMM estimate is returned without the residual decoder, which
-        was trained on noise-free landmarks.
+        (`gpmm.estimate_landmark_noise`). Unless it is the number 0, the GPMM estimate is returned without the residual
+        decoder, which was trained on noise-free landmarks.
 
     Raises:
-      ValueError: wrong shapes, a traced `neutral` (it is preprocessed on the host), or `noise` for a model that stores
-        only a linear map (see `pack`).
+      ValueError: wrong shapes, negative noise, or `noise` for a model that stores only a linear map (see `pack`).
     """
-    if isinstance(neutral, Tracer):
-        raise ValueError("neutral: every face is prepared on the host and cannot be traced: pass it as a constant")
-    neutral = np.asarray(neutral)
+    marks = jnp.asarray(displacements, face.neutral.dtype)
+    exact = isinstance(noise, float | int) and noise == 0
     if noise is None:
-        marks = np.asarray(displacements)
-        noise = gpmm.estimate_landmark_noise(params.base, neutral, marks.reshape(-1, *marks.shape[-2:]))
-    base = linear.apply(cached_linear_map(params.base, neutral, noise), jnp.asarray(displacements))
-    if noise or not refined:
+        noise = gpmm.estimate_landmark_noise(params.base, face.statistics, marks.reshape(-1, *marks.shape[-2:]))
+    face_map = face.map
+    if not exact:
+        face_map = gpmm.posterior_map(gpmm.with_landmark_noise(params.base, noise), face.statistics)
+    base = linear.apply(face_map, marks)
+    if not exact or not refined or base.size == 0:
         return base
     lead = base.shape[:-2]
     flat = base.reshape(math.prod(lead), *base.shape[-2:])
-    marks = jnp.asarray(displacements, jnp.float32).reshape(len(flat), len(params.base.landmark_index), 3)
-    rest = jnp.broadcast_to(jnp.asarray(neutral, jnp.float32), flat.shape)
-    return jnp.asarray(refine(params, marks, flat, rest)).reshape(*lead, *base.shape[-2:])
+    moved = refine(params, marks.reshape(len(flat), *marks.shape[-2:]), flat, face.neutral)
+    return moved.reshape(base.shape)
 
 
-def cached_linear_map(base: gpmm.GPMM, neutral: Float[np.ndarray, "N 3"], noise: float = 0.0) -> linear.LinearMap:
-    """Return `gpmm.linear_map` of the model with landmark noise sigma (mm), cached for the last `CACHE_SIZE` faces."""
-    key = id(base), hashlib.sha256(np.ascontiguousarray(neutral).tobytes()).hexdigest(), noise
-    if key not in _cache:
-        # The model is kept with its map, so that its id cannot be reused by another model.
-        _cache[key] = base, gpmm.linear_map(gpmm.with_landmark_noise(base, noise), neutral)
-        while len(_cache) > CACHE_SIZE:
-            _cache.popitem(last=False)
-    _cache.move_to_end(key)
-    return _cache[key][1]
-
-
+@jax.jit
 def refine(
     params: GPMMResidual,
     displacements: Float[Array | np.ndarray, "B L 3"],
     base: Float[Array | np.ndarray, "B N 3"],
-    neutral: Float[Array | np.ndarray, "B N 3"],
-) -> Float[Array | np.ndarray, "B N 3"]:
-    """Add the residual decoder's output to the GPMM estimates `base` of landmark displacements of neutral faces."""
-    if len(base) == 0 or float(params.network.gate) == 0:
-        return base
-    return _refine(params.network, params.hierarchy, params.tables, displacements, base, neutral)
+    neutral: Float[Array | np.ndarray, "*B N 3"],
+) -> Float[Array, "B N 3"]:
+    """Add the residual decoder's output to the GPMM estimates `base`; `neutral` is one face, or one per sample.
 
-
-@jax.jit
-def _refine(
-    network: residual.ResidualDecoder,
-    hierarchy: Hierarchy,
-    tables: strain.VertexTriangles,
-    displacements: Array,
-    base: Array,
-    neutral: Array,
-) -> Array:
-    """Refine equal pieces of at most 16 samples, one after another, so that temporary arrays stay small."""
+    Equal pieces of at most 16 samples are refined one after another, so that temporary arrays stay small.
+    """
     count = len(base)
-    pieces = -(-count // BATCH)
+    pieces = max(-(-count // BATCH), 1)
     size = -(-count // pieces)
-    parts = [
-        jnp.pad(x, ((0, pieces * size - count), (0, 0), (0, 0)), mode="edge").reshape(pieces, size, *x.shape[1:])
-        for x in (displacements, base, neutral)
-    ]
-    out = jax.lax.map(lambda part: residual.apply(network, hierarchy, tables, *part), tuple(parts))
-    return out.reshape(-1, *out.shape[2:])[:count]
+    rows = [displacements, base] + ([neutral] if np.ndim(neutral) == 3 else [])
+
+    def cut(x: Array | np.ndarray) -> Array:
+        padded = jnp.pad(x, ((0, pieces * size - count), (0, 0), (0, 0)), mode="edge")
+        return padded.reshape(pieces, size, *x.shape[1:])
+
+    def one(part: tuple[Array, ...]) -> Array:
+        rest = part[2] if len(part) == 3 else neutral
+        return residual.apply(params.network, params.hierarchy, params.tables, part[0], part[1], rest)
+
+    def run(parts: tuple[Array, ...]) -> Array:
+        out = jax.lax.map(one, parts)
+        return out.reshape(-1, *out.shape[2:])[:count]
+
+    parts = tuple(cut(x) for x in rows)
+    return jax.lax.cond(params.network.gate == 0, lambda _: jnp.asarray(base), run, parts)
 
 
 def pack(params: GPMMResidual, *, components: int | None = None) -> dict[str, Any]:
@@ -131,17 +131,16 @@ def pack(params: GPMMResidual, *, components: int | None = None) -> dict[str, An
     """
     base = params.base
     tree: dict[str, Any] = {name: np.asarray(getattr(base, name), np.float32) for name in ("face", "motion", "hold")}
-    tree |= {"landmark_index": np.asarray(base.landmark_index, np.int32), "prior": np.array(base.prior, np.float64)}
-    statistics = base.statistics
-    if isinstance(statistics, linear.Basis):
+    prior = np.array([base.prior.carried, base.prior.smooth, base.prior.noise], np.float64)
+    tree |= {"landmark_index": np.asarray(base.landmark_index, np.int32), "prior": prior}
+    if base.shared_map is None:
         leading = slice(components)
-        tree["mean"] = np.asarray(statistics.vertex_mean, np.float32)
-        tree["components"] = np.asarray(statistics.components[leading], np.float16)
-        tree["variance"] = np.asarray(statistics.variance[leading], np.float32)
+        tree["mean"] = np.asarray(base.mean, np.float32)
+        tree["components"] = np.asarray(base.components[leading], np.float16).reshape(-1, base.face.size)
+        tree["variance"] = np.asarray(base.variance[leading], np.float32)
     else:
-        face_map = gpmm.linear_map(base, base.face)
-        (tree["map"],) = face_map.factors
-        tree |= {"mean": face_map.vertex_mean, "landmark_mean": face_map.landmark_mean}
+        (factor,) = base.shared_map.factors
+        tree |= {"map": factor, "mean": base.shared_map.vertex_mean, "landmark_mean": base.shared_map.landmark_mean}
     return {"base": tree, "network": params.network._asdict()}
 
 
@@ -151,27 +150,25 @@ def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: Int[np.ndarray, "F
     Raises:
       KeyError: a tree that `pack` did not write.
     """
-    base = dict(tree["base"])
-    at, prior = np.asarray(base["landmark_index"]), np.asarray(base["prior"])
-    as_float64 = functools.partial(np.asarray, dtype=np.float64)
+    base = tree["base"]
+    at, (carried, smooth, noise) = np.asarray(base["landmark_index"]), np.asarray(base["prior"]).tolist()
+    face, motion, hold, mean = (np.asarray(base[name], np.float64) for name in ("face", "motion", "hold", "mean"))
+    shared, components, variance = None, np.zeros((0, *face.shape)), np.zeros(0)
     if "components" in base:
-        components = as_float64(base["components"])
-        marks = components.reshape(len(components), -1, 3)[:, at].reshape(len(components), -1)
-        mean = as_float64(base["mean"])
-        variance = as_float64(base["variance"])
-        statistics = linear.Basis(mean[at], mean, components, marks, variance, float(variance.sum()))
+        components = np.asarray(base["components"], np.float64).reshape(-1, *face.shape)
+        variance = np.asarray(base["variance"], np.float64)
     else:
-        statistics = linear.affine(base["landmark_mean"], base["mean"], base["map"])
-    prior = gpmm.Prior(bool(prior[0]), float(prior[1]), float(prior[2]))
-    face, motion, hold = (as_float64(base[name]) for name in ("face", "motion", "hold"))
-    faces = np.asarray(faces)
-    model = gpmm.GPMM(faces, at, face, motion, hold, statistics, prior)
+        shared = linear.affine(base["landmark_mean"], base["mean"], base["map"])
+    model = gpmm.build(
+        faces, at, face=face, motion=motion, hold=hold, mean=mean, components=components, variance=variance,
+        prior=gpmm.Prior(bool(carried), smooth, noise), shared_map=shared,
+    )  # fmt: skip
     # A record, as `pack` returns it, or a dict, as read from a file.
     scale, network = tree["network"]["scale"], tree["network"]
     scale = residual.Scale(**scale) if isinstance(scale, dict) else scale
     return GPMMResidual(
-        model,
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) if np.asarray(leaf).dtype.kind == "f" else leaf, model),
         jax.tree.map(jnp.asarray, residual.ResidualDecoder(scale, network["weights"], network["gate"])),
         jax.device_put(hierarchy),
-        jax.device_put(strain.vertex_triangles(faces, len(face))),
+        jax.device_put(strain.vertex_triangles(np.asarray(faces), len(face))),
     )

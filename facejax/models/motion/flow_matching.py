@@ -100,7 +100,7 @@ def velocity(
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     y, s = state
     scale = state_std(chart, start, end)
-    context = jnp.concatenate([_time_embedding(time), weights["labels"][0, start], weights["labels"][1, end], pose])
+    context = jnp.concatenate([_time_embedding(jnp.asarray(time, y.dtype)), weights["labels"][0, start], weights["labels"][1, end], pose])
     centre = to_state(chart, tangent_pca.conditional_mean(chart, start, end, pose))[0]
     offset = (y - centre)[0, 0] / scale
     # Both the offset from the mean in standard deviations and y itself: the first saturates far from the mean.
@@ -118,7 +118,7 @@ def sample_source(
     chart: TangentPCA, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
 ) -> State:
     """Draw a state at time 0 from the Gaussian of a label pair and a pose, wrapped onto the sphere."""
-    noise = jax.random.normal(key, (tangent_pca.SCALARS + len(chart.basis),))
+    noise = jax.random.normal(key, (tangent_pca.SCALARS + len(chart.basis),), chart.mean.dtype)
     return to_state(
         chart,
         tangent_pca.conditional_mean(chart, start, end, pose) + tangent_pca.conditional_std(chart, start, end) * noise,
@@ -173,12 +173,12 @@ def sample(
         y = sphere.exp(y, sphere.transport(middle[0], y, v) / steps)
         return (y / sphere.norm(y)[..., None, None, None], s + rate / steps), None
 
-    state, _ = jax.lax.scan(advance, state, jnp.arange(steps) / steps)
+    state, _ = jax.lax.scan(advance, state, jnp.arange(steps, dtype=state[1].dtype) / steps)
     return from_state(params.chart, state, start, end)
 
 
 def _reference_point(chart: TangentPCA) -> Array:
-    return jnp.zeros((1, 1, len(chart.basis) + 1)).at[0, 0, 0].set(1.0)
+    return jnp.zeros((1, 1, len(chart.basis) + 1), chart.basis.dtype).at[0, 0, 0].set(1.0)
 
 
 @jax.jit
@@ -188,6 +188,6 @@ def state_std(chart: TangentPCA, start: ArrayLike, end: ArrayLike) -> Float[Arra
     return jnp.append(jnp.sqrt(jnp.mean(scale**2)), scale)
 
 
-def _time_embedding(time: ArrayLike) -> Array:
-    angle = jnp.pi * jnp.asarray(time) * jnp.arange(FREQUENCIES)
+def _time_embedding(time: Array) -> Array:
+    angle = jnp.pi * time * jnp.arange(FREQUENCIES, dtype=time.dtype)
     return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])

@@ -39,7 +39,7 @@ def sample(
     displacements from neutral. The Frobenius norm of q is the square root of T-1.
 
     Args:
-      start, end: label indices (0: neutral), not checked; `pipeline.label_indices` looks up names.
+      start, end: label indices (0: neutral), not checked; `models.labels.encode` looks up names.
       pose: from `start_poses.sample` or `tangent_pca.encode_pose`, or zero for the mean peak.
       steps: of integration, for flow matching only.
 

@@ -169,7 +169,7 @@ def sample(
     params: Motion3DGAN, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
 ) -> Motion:
     """Draw a motion between two labels that starts at a pose."""
-    noise = jax.random.normal(key, params.weights["skip"].shape[:1])
+    noise = jax.random.normal(key, params.weights["skip"].shape[:1], params.weights["skip"].dtype)
     tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
     return Motion(sphere.exp(params.chart.p, tangent), log_length, log_seconds)
 

@@ -138,7 +138,7 @@ def sample(
 ) -> Motion:
     """Draw a motion between two labels. The pose is ignored, and the duration is the mean of the label pair."""
     del pose
-    noise = jax.random.normal(key, (_noise(params),))
+    noise = jax.random.normal(key, (_noise(params),), params.chart.p.dtype)
     tangent, log_length = generator.apply(params, noise, start, end)
     return Motion(sphere.exp(params.chart.p, tangent), log_length, params.chart.scalar_mean[start, end, 1])
 
@@ -156,7 +156,7 @@ def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:
 
 def _one_hots(chart: TangentPCA, start: ArrayLike, end: ArrayLike) -> Array:
     labels = len(chart.scalar_mean)
-    return jnp.concatenate([jax.nn.one_hot(start, labels), jax.nn.one_hot(end, labels)])
+    return jnp.concatenate([jax.nn.one_hot(label, labels, dtype=chart.p.dtype) for label in (start, end)])
 
 
 def _tile(image: Array, condition: Array) -> Array:

@@ -75,9 +75,9 @@ def sample(params: StartPoses, key: Array, label: ArrayLike) -> Float[Array, " D
     """Draw the pose of a peak; zero for the label neutral."""
     which_key, blur_key = jax.random.split(key)
     count = params.count[label]
-    which = jnp.minimum(jnp.floor(jax.random.uniform(which_key) * count), count - 1).astype(jnp.int32)
+    which = jnp.minimum(jnp.floor(jax.random.uniform(which_key, (), count.dtype) * count), count - 1).astype(jnp.int32)
     # Rows beyond the count are zero, so a plain sum gives the mean.
     mean = jnp.sum(params.poses[label], axis=0) / count
-    blur = params.root[label] @ jax.random.normal(blur_key, mean.shape)
-    drawn = mean + jnp.sqrt(1 - BLUR**2) * (params.poses[label, which] - mean) + BLUR * blur
+    blur = params.root[label] @ jax.random.normal(blur_key, mean.shape, mean.dtype)
+    drawn = mean + (1 - BLUR**2) ** 0.5 * (params.poses[label, which] - mean) + BLUR * blur
     return jnp.where(jnp.asarray(label) == 0, 0.0, drawn)

@@ -162,13 +162,13 @@ def conditional_mean(
     chart: TangentPCA, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
 ) -> Float[Array, " coordinates"]:
     """Return the mean coordinates (2 + R,) of a label pair's motions given the pose, by linear regression."""
-    return jnp.append(jnp.zeros(SCALARS), chart.mean[start, end]) + pose @ chart.gain[start]
+    return jnp.append(jnp.zeros(SCALARS, chart.mean.dtype), chart.mean[start, end]) + pose @ chart.gain[start]
 
 
 @jax.jit
 def conditional_std(chart: TangentPCA, start: ArrayLike, end: ArrayLike) -> Float[Array, " coordinates"]:
     """Return the standard deviation (2 + R,) of the coordinates of a label pair about `conditional_mean`."""
-    return jnp.append(jnp.ones(SCALARS), chart.scale[start, end])
+    return jnp.append(jnp.ones(SCALARS, chart.scale.dtype), chart.scale[start, end])
 
 
 def _poses(

@@ -58,14 +58,16 @@ def fit(
         train, hierarchy, folder / "meshes", plan=plans.residual, seed=seed, base=base, device_mesh=device_mesh
     )
     return bundle.Models(
-        labels=data.labels,
+        labels=bundle.Labels(data.labels),
         face=bundle.Face(mean, faces, at, np.zeros(0, np.int32), rbf_weights.face_region(mean, faces, at)),
         motion=generator,
         starts=starts,
         hierarchy=hierarchy,
         decoder=decoder,
-        about={"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
-        | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}},
+        about=bundle.Provenance(
+            {"data": data.index.get("name"), "spec": dict(data.index["spec"]), "seed": seed}
+            | {"plans": {name: plan._asdict() for name, plan in plans._asdict().items()}}
+        ),
     )
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from facejax.data.mesh_subset import MeshSubset
-from facejax.models.decoders import gpmm, linear
+from facejax.models.decoders import gpmm, gpmm_fit, linear
 
 SMOOTHNESS_GRID = (0.0, 0.003, 0.01, 0.03, 0.06, 0.12, 0.25)
 NOISE_GRID = (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -50,8 +50,8 @@ class _People:
 
     meshes: MeshSubset
 
-    def __iter__(self) -> Iterator[gpmm.Person]:
-        return (gpmm.Person(*self.meshes.person(subject)) for subject in self.meshes.subjects)
+    def __iter__(self) -> Iterator[gpmm_fit.Person]:
+        return (gpmm_fit.Person(*self.meshes.person(subject)) for subject in self.meshes.subjects)
 
 
 def fit(
@@ -59,7 +59,7 @@ def fit(
     *,
     by: str = "subjects",
     carried: Sequence[bool] = (False, True),
-    components: int = gpmm.COMPONENTS,
+    components: int = gpmm_fit.COMPONENTS,
 ) -> FittedGPMM:
     """Choose the prior and fit the model.
 
@@ -80,25 +80,28 @@ def fit(
         raise ValueError(f"expected meshes of two or more {by}, got {len(names)}")
     held = [np.flatnonzero(np.isin(of, part)) for part in np.array_split(names, min(FOLDS, len(names)))]
     faces, at = np.asarray(train.data.faces), np.asarray(train.data.landmark_index)
-    face, overall_motion = gpmm.mean_face_and_motion(_People(train))
+    face, overall_motion = gpmm_fit.mean_face_and_motion(_People(train))
     errors, models, learnt = {}, {}, {}
     for kind in carried:
         learnt[kind] = _Displacements(train, _transfer(train, faces, face, overall_motion) if kind else None)
         total, models[kind] = np.zeros(()), []
         for rows in held:
             fit_on = np.setdiff1d(np.arange(train.count), rows)[::2]
-            _, motion = gpmm.mean_face_and_motion(_People(train.rows(fit_on)))
-            known = gpmm.fit_statistics(
+            _, motion = gpmm_fit.mean_face_and_motion(_People(train.rows(fit_on)))
+            known = gpmm_fit.fit_statistics(
                 learnt[kind].only(fit_on), carried=kind, components=max(1, 3 * components // 4), passes=2
             )
-            params = gpmm.GPMM(faces, at, face, motion, overall_motion, known, gpmm.Prior(kind))
+            params = gpmm_fit.assemble(
+                known, gpmm.Prior(kind), faces, at, face=face, motion=motion, hold=overall_motion
+            )
             models[kind].append((params, rows))
             total = total + _errors(params, train, rows)
         errors |= dict(zip(_priors(kind), (total / len(held)).tolist(), strict=True))
     prior = _best(errors)
-    folded = tuple((params._replace(prior=prior), rows) for params, rows in models[prior.carried])
-    known = gpmm.fit_statistics(learnt[prior.carried], carried=prior.carried, components=components)
-    return FittedGPMM(gpmm.GPMM(faces, at, face, overall_motion, overall_motion, known, prior), errors, folded)
+    folded = tuple((gpmm_fit.with_prior(params, prior), rows) for params, rows in models[prior.carried])
+    known = gpmm_fit.fit_statistics(learnt[prior.carried], carried=prior.carried, components=components)
+    params = gpmm_fit.assemble(known, prior, faces, at, face=face, motion=overall_motion, hold=overall_motion)
+    return FittedGPMM(params, errors, folded)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +125,7 @@ def _transfer(train: MeshSubset, faces: np.ndarray, face: np.ndarray, overall_mo
     """Return all displacements (G, N, 3) on the mean face in float32: 40 KB per mesh of 3,260 vertices."""
     found = np.empty((train.count, *face.shape), np.float32)
     for subject, person in zip(train.subjects, _People(train), strict=True):
-        found[train.owner == subject] = gpmm.transfer_to(person, faces, face, overall_motion)
+        found[train.owner == subject] = gpmm_fit.transfer_to(person, faces, face, overall_motion)
     return found
 
 
@@ -140,8 +143,8 @@ def _errors(params: gpmm.GPMM, train: MeshSubset, rows: np.ndarray) -> np.ndarra
     for subject in chosen:
         mine = rows[train.owner[rows] == subject]
         landmarks, vertices = train.read(np.sort(rng.permutation(mine)[:EVALUATED_FRAMES]))
-        known = gpmm.covariances(params, train.data.neutral[subject], vertex_index=only)
-        off = [gpmm.predict(known, prior, landmarks) - vertices[:, only] for prior in _priors(params.prior.carried)]
+        known = gpmm_fit.covariances(params, train.data.neutral[subject], vertex_index=only)
+        off = [gpmm_fit.predict(known, prior, landmarks) - vertices[:, only] for prior in _priors(params.prior.carried)]
         total = total + np.array([np.linalg.norm(one, axis=-1).mean(axis=-1).sum() for one in off])
         count += len(vertices)
     return total / count

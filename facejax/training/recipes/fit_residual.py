@@ -7,6 +7,7 @@ run resumes from its checkpoints; a finished one is read from `network.safetenso
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import os
 from pathlib import Path
@@ -64,7 +65,7 @@ def fit(
     chosen = hashlib.sha256(train.indices.tobytes()).hexdigest()
     base = base or fit_gpmm.fit(train, by=by)
     claim = {"plan": plan._asdict(), "by": by, "seed": seed, "dataset": data.index["spec"], "meshes": chosen}
-    metric_logger.claim_folder(folder, claim | {"base": base.params.prior._asdict()})
+    metric_logger.claim_folder(folder, claim | {"base": dataclasses.asdict(base.params.prior)})
     tables = jax.device_put(strain.vertex_triangles(np.asarray(data.faces), len(base.params.face)))
     hierarchy = jax.device_put(hierarchy)
     done = folder / "network.safetensors"
@@ -118,7 +119,7 @@ def fit(
     if sharding.is_primary():
         weights.save(done, network._asdict())
     sharding.barrier("the network is written")
-    return fitted._replace(network=network)
+    return fitted.replace(network=network)
 
 
 def _load(path: Path, hierarchy: Hierarchy, base: gpmm.GPMM, landmarks: int) -> residual.ResidualDecoder:

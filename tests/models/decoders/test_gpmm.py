@@ -1,11 +1,15 @@
 """The carried morphable model against the whole Gaussian written out, ridge regression and PCA; what its prior does."""
 
+import dataclasses
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
 from facejax.mesh import deformation_transfer
-from facejax.models.decoders import gpmm, linear
+from facejax.models.decoders import gpmm, gpmm_fit, linear
 
 BALL = trimesh.creation.icosphere(subdivisions=1)  # 42 vertices
 N, FACES = len(BALL.vertices), np.asarray(BALL.faces)
@@ -25,7 +29,7 @@ def person(seed, *, frames=FRAMES, neutral=None, modes=MODES):
         moved = deformation_transfer.DeformationTransfer(
             MEAN, neutral, FACES, deformation_transfer.anchor_weights(np.full(N, 2.0))
         )(moved)
-    return gpmm.Person(neutral, moved[:, PICKED], moved)
+    return gpmm_fit.Person(neutral, moved[:, PICKED], moved)
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +38,7 @@ def people():
 
 
 def fit(people, *prior, **options):
-    return gpmm.fit(people, FACES, PICKED, prior=gpmm.Prior(*prior), **options)
+    return gpmm_fit.fit(people, FACES, PICKED, prior=gpmm.Prior(*prior), **options)
 
 
 def error(params, someone):
@@ -44,7 +48,7 @@ def error(params, someone):
 
 def test_the_survey_is_the_plain_loop(people):
     some = [people[0], people[1]._replace(landmarks=people[1].landmarks[:7], vertices=people[1].vertices[:7])]
-    face, motion = gpmm.mean_face_and_motion(some)
+    face, motion = gpmm_fit.mean_face_and_motion(some)
     np.testing.assert_allclose(face, (some[0].neutral + some[1].neutral) / 2)
     frames = [np.sum(frame**2, axis=-1) for each in some for frame in each.vertices]
     np.testing.assert_allclose(motion, np.sqrt(np.mean(frames, axis=0)))
@@ -70,17 +74,16 @@ def test_carried_to_the_one_face_that_there_is_it_is_pca():
 def test_against_the_whole_gaussian(people, carried):
     """Mean and covariance of all 3 N coordinates on the face, conditioned on the landmarks'."""
     prior = gpmm.Prior(carried, 0.3, 0.05)
-    params, new = fit(people, *prior, components=4), person(7)
-    known = params.statistics
+    params, new = fit(people, *dataclasses.astuple(prior), components=4), person(7)
     if carried:
         carrier = deformation_transfer.DeformationTransfer(
             params.face, new.neutral, FACES, deformation_transfer.anchor_weights(params.motion)
         )
-        mean = carrier(known.vertex_mean[None])[0].ravel()
+        mean = carrier(params.mean[None])[0].ravel()
         spread = sum(
             variance * np.outer(moved, moved)
-            for variance, component in zip(known.variance, known.components, strict=True)
-            for moved in [carrier(component.reshape(1, N, 3)).ravel()]
+            for variance, component in zip(params.variance, params.components, strict=True)
+            for moved in [carrier(component[None]).ravel()]
         )
     else:
         flat = np.concatenate([p.vertices for p in people]).reshape(-1, 3 * N)
@@ -104,16 +107,16 @@ def test_against_the_whole_gaussian(people, carried):
 def test_answers_of_a_few_frames_are_those_of_the_map(people, carried, only):
     params, new = fit(people, carried, 0.1, 1e-2, components=4), person(7)
     whole = linear.apply(gpmm.linear_map(params, new.neutral), new.landmarks)
-    known = gpmm.covariances(params, new.neutral, vertex_index=only)
-    found = gpmm.predict(known, params.prior, new.landmarks)
+    known = gpmm_fit.covariances(params, new.neutral, vertex_index=only)
+    found = gpmm_fit.predict(known, params.prior, new.landmarks)
     np.testing.assert_allclose(found, whole if only is None else whole[:, only], atol=1e-4)
 
 
 def test_another_prior_is_that_of_a_fit_with_it(people):
     params, new = fit(people, True, 0.1, 1e-2, components=4), person(7)
     other = gpmm.Prior(True, 0.3, 1.0)
-    found = gpmm.predict(gpmm.covariances(params, new.neutral), other, new.landmarks)
-    expected = linear.apply(gpmm.linear_map(fit(people, *other, components=4), new.neutral), new.landmarks)
+    found = gpmm_fit.predict(gpmm_fit.covariances(params, new.neutral), other, new.landmarks)
+    expected = linear.apply(gpmm.linear_map(fit(people, *dataclasses.astuple(other), components=4), new.neutral), new.landmarks)
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
@@ -154,6 +157,26 @@ def test_what_never_moves_stays():
         assert np.abs(found[:, MEAN[:, 2] < -20]).max() < 1e-6 < np.abs(found).max()
 
 
+@pytest.mark.parametrize("carried", [True, False], ids=["carried", "plain"])
+def test_a_face_may_be_traced_vectorised_and_differentiated(people, carried):
+    params = fit(people, carried, 0.3, 0.05, components=4)
+    faces = np.stack([person(seed).neutral for seed in (7, 8)])
+    marks = person(7).landmarks[0]
+
+    def decode(neutral):
+        return linear.apply(gpmm.linear_map(params, neutral), marks)
+
+    each = [decode(face) for face in faces]
+    np.testing.assert_allclose(jax.jit(jax.vmap(decode))(faces), each, atol=2e-4)
+    with jax.enable_x64(True):
+        value = lambda neutral: jnp.sum(jnp.sin(decode(neutral)))  # noqa: E731
+        slope = jax.grad(value)(jnp.asarray(faces[0]))
+        assert slope.dtype == np.float64
+        step = np.random.default_rng(0).normal(size=slope.shape)
+        along = (value(faces[0] + 1e-5 * step) - value(faces[0] - 1e-5 * step)) / 2e-5
+        np.testing.assert_allclose(np.sum(slope * step), along, rtol=1e-6, atol=1e-9)
+
+
 def test_wrong_input_is_named(people):
     params = fit(people, False, 0.0, 1e-2)
     with pytest.raises(ValueError, match=r"neutral: expected vertices \(42, 3\), got \(41, 3\)"):
@@ -174,8 +197,9 @@ def test_noise_of_landmarks_is_found(noise):
     shapes = rng.normal(size=(4, *rest.shape))
     moved = np.einsum("fk,knx->fnx", rng.normal(size=(200, 4)), shapes)
     prior = gpmm.Prior(carried=False, smooth=0.0, noise=1e-8)
-    params = gpmm.fit([gpmm.Person(rest, moved[:100, at], moved[:100])], faces, at, prior=prior)
+    params = gpmm_fit.fit([gpmm_fit.Person(rest, moved[:100, at], moved[:100])], faces, at, prior=prior)
     marks = moved[100:, at] + noise * rng.standard_normal((100, 30, 3))
-    assert gpmm.estimate_landmark_noise(params, rest, marks) == pytest.approx(noise, rel=0.05, abs=0.01)
+    known = gpmm.on_face(params, rest)
+    assert gpmm.estimate_landmark_noise(params, known, marks) == pytest.approx(noise, rel=0.05, abs=0.01)
     # One frame tells as well, less surely.
-    assert gpmm.estimate_landmark_noise(params, rest, marks[:1]) == pytest.approx(noise, rel=0.4, abs=0.01)
+    assert gpmm.estimate_landmark_noise(params, known, marks[:1]) == pytest.approx(noise, rel=0.4, abs=0.01)

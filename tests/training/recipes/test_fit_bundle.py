@@ -35,7 +35,7 @@ def test_models_of_ones_own_generate_from_a_file(models, tiny_store, tmp_path):
     errors = vertex_error.model_errors(models, tiny_store)
     assert 0 < errors["head"] < errors["face"] < 0.3
     path = tmp_path / "own.safetensors"
-    pipeline.save(path, models._replace(about=models.about | {"error_mm": errors}))
+    pipeline.save(path, models.replace(about=models.about | {"error_mm": errors}))
     read = pipeline.load(path)
     assert read.labels == tiny_store.labels and read.about["error_mm"] == errors
     neutral = np.asarray(tiny_store.neutral[5])

@@ -1,0 +1,201 @@
+"""prepare, motion and vertices as pure functions: every transformation of JAX, in any order, on tiny models."""
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import PartitionSpec as P
+
+from facejax.inference import pipeline
+from tests import tiny_models
+
+FRAMES = 4
+KEY = jax.random.key(7)
+
+
+@pytest.fixture(scope="module", params=["gpmm", "s2d"])
+def models(request):
+    return tiny_models.make(decoder=request.param)
+
+
+@pytest.fixture(scope="module")
+def neutrals():
+    rest = tiny_models.make().face.vertices
+    return np.stack([rest @ (np.eye(3) + 0.1 * np.diag(row)) for row in np.eye(3)]).astype(np.float32)
+
+
+def whole(models, key, labels, neutral, intensity=1.0):
+    """From labels to the vertices of the last frames."""
+    face = pipeline.prepare(models, neutral)
+    moved = pipeline.motion(models, key, labels, face, frames=FRAMES, intensity=intensity)
+    return pipeline.vertices(models, face, moved[-2:])
+
+
+LABELS = np.array([0, 1, 2], np.int32)
+
+
+def test_jit_first_and_eager_after_and_the_reverse(models, neutrals):
+    jax.clear_caches()
+    compiled = jax.jit(whole)(models, KEY, LABELS, neutrals[0])
+    eager = whole(models, KEY, LABELS, neutrals[0])
+    again = jax.jit(lambda *a: whole(*a))(models, KEY, LABELS, neutrals[0])
+    np.testing.assert_allclose(compiled, eager, atol=5e-5)
+    np.testing.assert_allclose(again, eager, atol=5e-5)
+    # Models that are closed over are constants, and give the same.
+    np.testing.assert_allclose(jax.jit(lambda face: whole(models, KEY, LABELS, face))(neutrals[0]), eager, atol=5e-5)
+
+
+def test_vmap_over_keys_labels_and_faces_at_once(models, neutrals):
+    keys = jax.random.split(KEY, 3)
+    labels = np.array([[0, 1, 2], [2, 0, 1], [1, 2, 0]], np.int32)
+    expected = [whole(models, *each) for each in zip(keys, labels, neutrals, strict=True)]
+    found = jax.vmap(whole, (None, 0, 0, 0))(models, keys, labels, neutrals)
+    np.testing.assert_allclose(found, expected, atol=5e-5)
+    for axes, row in (((None, 0, None, None), 0), ((None, None, 0, None), 1), ((None, None, None, 0), 2)):
+        arguments = [keys[0], labels[0], neutrals[0]]
+        arguments[row] = (keys, labels, neutrals)[row]
+        one = [keys[0], labels[0], neutrals[0]]
+        one[row] = arguments[row][2]
+        np.testing.assert_allclose(
+            jax.vmap(whole, axes)(models, *arguments)[2], whole(models, *one), atol=5e-5, err_msg=str(axes)
+        )
+
+
+def test_leading_axes_of_labels_are_one_motion_each(models, neutrals):
+    face = pipeline.prepare(models, neutrals[0])
+    labels = np.array([[[0, 1], [0, 2]], [[1, 0], [2, 0]]], np.int32)
+    found = pipeline.motion(models, KEY, labels, face, frames=FRAMES)
+    keys = jax.random.split(KEY, (2, 2))
+    assert found.shape == (2, 2, FRAMES, 4, 3)
+    for i in np.ndindex(2, 2):
+        one = pipeline.motion(models, keys[i], labels[i], face, frames=FRAMES)
+        np.testing.assert_allclose(found[i], one, atol=1e-5)
+    np.testing.assert_array_equal(pipeline.motion(models, keys, labels, face, frames=FRAMES), found)
+
+
+@pytest.mark.parametrize("what", ["neutral", "intensity", "landmarks", "noise"])
+def test_derivatives_are_those_of_finite_differences(models, neutrals, what):
+    with jax.enable_x64(True):
+        exact = tiny_models.cast(models, jnp.float64)
+        neutral = jnp.asarray(neutrals[0], jnp.float64)
+        face = pipeline.prepare(exact, neutral)
+        marks = pipeline.motion(exact, KEY, LABELS, face, frames=FRAMES)
+        assert marks.dtype == jnp.float64
+        gpmm = hasattr(exact.decoder, "base")
+        value, at = {
+            "neutral": (lambda x: whole(exact, KEY, LABELS, x), neutral),
+            "intensity": (lambda x: whole(exact, KEY, LABELS, neutral, x), jnp.asarray(0.8)),
+            "landmarks": (lambda x: pipeline.vertices(exact, face, x), marks),
+            "noise": (lambda x: pipeline.vertices(exact, face, marks, noise=x if gpmm else 0.0), jnp.asarray(0.3)),
+        }[what]
+        total = jax.jit(lambda x: jnp.sum(jnp.sin(value(x) / 10)))
+        slope = jax.grad(total)(at)
+        step = np.random.default_rng(0).normal(size=np.shape(at))
+        along = (total(at + 1e-5 * step) - total(at - 1e-5 * step)) / 2e-5
+        assert value(at).dtype == jnp.float64
+        np.testing.assert_allclose(np.sum(slope * step), along, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("generator", ["flow", "gan"])
+def test_float32_models_stay_float32_where_float64_is_enabled(neutrals, generator):
+    models = tiny_models.make(generator=generator)
+    expected = whole(models, KEY, LABELS, neutrals[0])
+    with jax.enable_x64(True):
+        found = whole(models, KEY, LABELS, neutrals[0])
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_inside_scan(models, neutrals):
+    face = pipeline.prepare(models, neutrals[0])
+    keys = jax.random.split(KEY, 3)
+
+    def advance(total, key):
+        moved = pipeline.motion(models, key, LABELS, face, frames=FRAMES)
+        return total + pipeline.vertices(models, face, moved[-1]), None
+
+    found, _ = jax.lax.scan(advance, jnp.zeros_like(face.neutral), keys)
+    each = [pipeline.motion(models, key, LABELS, face, frames=FRAMES)[-1] for key in keys]
+    np.testing.assert_allclose(found, sum(pipeline.vertices(models, face, one) for one in each), atol=2e-4)
+
+
+def test_under_shard_map_on_several_devices(models, neutrals):
+    devices = jax.devices()
+    mesh = jax.make_mesh((len(devices),), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
+    keys = jax.random.split(KEY, 2 * len(devices))
+
+    def part(models, keys):
+        return jax.vmap(whole, (None, 0, None, None))(models, keys, LABELS, neutrals[0])
+
+    found = jax.jit(jax.shard_map(part, mesh=mesh, in_specs=(P(), P("data")), out_specs=P("data"), check_vma=False))(
+        models, keys
+    )
+    np.testing.assert_allclose(found, part(models, keys), atol=5e-5)
+
+
+def test_eight_threads_get_the_same(models, neutrals):
+    keys = jax.random.split(KEY, 8)
+    expected = [np.asarray(whole(models, key, LABELS, neutrals[i % 3])) for i, key in enumerate(keys)]
+    found = [None] * 8
+
+    def work(i):
+        found[i] = np.asarray(whole(models, keys[i], LABELS, neutrals[i % 3]))
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_one_compilation_per_shape_and_models_of_other_sizes(neutrals):
+    small = tiny_models.make()
+    other = small.replace(about=small.about | {"seed": 1}, starts=jax.tree.map(lambda x: x * 0.5, small.starts))
+    large = tiny_models.make(subdivisions=3)
+    traced = []
+
+    @jax.jit
+    def counted(models, key, labels, neutral):
+        traced.append(len(neutral))
+        return whole(models, key, labels, neutral)
+
+    first = counted(small, KEY, LABELS, neutrals[0])
+    counted(other, KEY, LABELS[::-1], neutrals[1])
+    assert len(traced) == 1
+    assert counted(large, KEY, LABELS, large.face.vertices).shape == (2, 642, 3)
+    np.testing.assert_array_equal(counted(small, KEY, LABELS, neutrals[0]), first)
+    assert len(traced) == 2
+
+
+def test_without_a_share_of_the_network_the_answer_is_the_linear_one(neutrals):
+    models = tiny_models.make()
+    network = models.decoder.network._replace(gate=jnp.zeros(()))
+    closed = models.replace(decoder=models.decoder.replace(network=network))
+    face = pipeline.prepare(closed, neutrals[0])
+    marks = pipeline.motion(closed, KEY, LABELS, face, frames=FRAMES)
+    found, linear = (pipeline.vertices(closed, face, marks, refined=refined) for refined in (True, False))
+    np.testing.assert_array_equal(found, linear)
+
+
+def test_wrong_arguments_are_named(models, neutrals):
+    face = pipeline.prepare(models, neutrals[0])
+    for labels, words in (
+        (np.array([0, 3]), "number 2 is 3, expected one from 0 to 2"),
+        (np.array([0, 0]), "repeats the previous one"),
+        (["neutral", "smile"], "models.labels.encode"),
+        (np.array([1]), "at least a start and an end"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            pipeline.motion(models, KEY, labels, face)
+    with pytest.raises(ValueError, match="unknown label 'smirk': did you mean smile"):
+        models.labels.encode(["neutral", "smirk"])
+    with pytest.raises(ValueError, match=r"landmarks: expected \(..., 4, 3\), got \(7, 5, 3\)"):
+        pipeline.vertices(models, face, np.zeros((7, 5, 3)))
+    with pytest.raises(ValueError, match="intensity must lie in 0..2, got 3"):
+        pipeline.motion(models, KEY, LABELS, face, intensity=3.0)
+    with pytest.raises(ValueError, match=r"neutral: expected vertices \(162, 3\)"):
+        pipeline.prepare(models, neutrals[0][1:])
