@@ -110,9 +110,9 @@ def invert(
 class TransferTables(NamedTuple):
     """Index tables of a mesh for `transfer`; W is the largest number of neighbours of a vertex, itself included."""
 
-    faces: Integer[np.ndarray, "F 3"]
-    neighbours: Integer[np.ndarray, "W N"]  # rows beyond a vertex's number of neighbours hold 0
-    slot: Integer[np.ndarray, "F 3 3"]  # of corner j among the neighbours of corner i, as an index into (W, N)
+    faces: Integer[Array | np.ndarray, "F 3"]
+    neighbours: Integer[Array | np.ndarray, "W N"]  # rows beyond a vertex's number of neighbours hold 0
+    slot: Integer[Array | np.ndarray, "F 3 3"]  # of corner j among the neighbours of corner i, as an index into (W, N)
 
 
 def transfer_tables(faces: Integer[np.ndarray, "F 3"], count: int) -> TransferTables:
@@ -169,7 +169,7 @@ def transfer(
 
 
 def _hat_gradients(
-    vertices: Float[Array, "N 3"], faces: Integer[np.ndarray, "F 3"]
+    vertices: Float[Array, "N 3"], faces: Integer[Array | np.ndarray, "F 3"]
 ) -> tuple[Float[Array, "F 3 3"], Float[Array, " F"]]:
     """Return the gradient (F, 3, 3) of each corner's hat function, and the areas (F,); zero without area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
