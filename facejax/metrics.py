@@ -102,7 +102,10 @@ def peak_displacement(
 def specificity(
     samples: Float[AnyArray, "*#lead K T L 3"], reference: Float[AnyArray, "*#lead _ L 3"]
 ) -> Float[Array, "*lead"]:
-    """Return the mean distance (...) of samples (..., K, T, L, 3) to the one reference (..., T, L, 3)."""
+    """Return the mean distance (...) of samples (..., K, T, L, 3) to the one reference (..., T, L, 3), in its unit.
+
+    The distance of two motions is the mean over frames and landmarks of the Euclidean distance.
+    """
     _check_motion(samples, 1, axes=4)
     if jnp.shape(reference)[-3:] != samples.shape[-3:]:
         raise ValueError(f"reference: expected (..., {samples.shape[-3:]}), got {jnp.shape(reference)}")

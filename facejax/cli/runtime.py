@@ -28,9 +28,9 @@ def configure() -> None:
 
 
 def quiet_warnings() -> None:
-    """Silence log messages of libraries that raise an exception as well.
+    """Silence the loggers of Orbax and asyncio, whose errors also reach the caller as exceptions.
 
-    Where a checkpoint cannot be written or read, Orbax's tasks log hundreds of lines before they raise.
+    If a checkpoint cannot be written or read, they log hundreds of lines before the exception is raised.
     """
     for name in ("asyncio", "absl"):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)

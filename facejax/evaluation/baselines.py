@@ -149,9 +149,7 @@ def _apply_gpmm(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral:
 
 def _apply_gpmm_with_noise(fitted: fit_gpmm.FittedGPMM, displacements: np.ndarray, neutral: np.ndarray) -> np.ndarray:
     known = gpmm.on_face(fitted.params, neutral)
-    params = gpmm.with_landmark_noise(
-        fitted.params, gpmm.estimate_landmark_noise(fitted.params, known, displacements)
-    )
+    params = gpmm.with_landmark_noise(fitted.params, gpmm.estimate_landmark_noise(fitted.params, known, displacements))
     return neutral + np.asarray(linear.apply(gpmm.linear_map(params, neutral), displacements))
 
 

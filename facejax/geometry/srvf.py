@@ -33,7 +33,7 @@ BLOCK = 32  # steps
 
 @jax.jit
 def encode(curve: Float[AnyArray, "*lead T L 3"]) -> tuple[Float[Array, "*lead T-1 L 3"], Float[Array, "*lead"]]:
-    """Encode a curve (..., T, L, 3) as q (..., T-1, L, 3) on the unit sphere, and log_length (...).
+    """Encode a curve (..., T, L, 3) as its SRVF, a point q (..., T-1, L, 3) on the unit sphere, and log_length (...).
 
     Nothing is centred or scaled here (see `facejax.geometry.align.normalise`). Raises `ValueError` on fewer
     than two frames, on a last axis that is not 3, or on a dtype that is not floating.

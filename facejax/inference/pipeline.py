@@ -249,7 +249,9 @@ def lengths(transitions: int, frames: int | Sequence[int]) -> tuple[int, ...]:
     values = np.asarray(frames)
     found: list[Any] = [values.item()] * transitions if values.ndim == 0 else values.tolist()
     if len(found) != transitions:
-        raise ValueError(f"frames: expected one number, or {transitions} for {transitions} transitions, got {len(found)}")
+        raise ValueError(
+            f"frames: expected one number, or {transitions} for {transitions} transitions, got {len(found)}"
+        )
     if any(n != int(n) or n < 2 for n in found):
         raise ValueError(f"frames: expected whole numbers of 2 or more, got {frames}")
     return tuple(int(n) for n in found)

@@ -1,7 +1,8 @@
 """Non-rigid registration of a template to a scan, and transfer of the template's motion to the scan's vertices.
 
-In outline Amberg et al. 2007 and Li et al. 2017: landmarks align the template rigidly, a morphable model of heads fits
-the shape, then single vertices move under a smoothness constraint. The scan may have any topology, holes and noise.
+Iterative closest points (ICP), in outline as in Amberg et al. 2007 and Li et al. 2017: landmarks align the template
+rigidly, a morphable model of heads fits the shape, then single vertices move under a smoothness constraint. The scan
+may have any topology, holes and noise.
 V vertices of the scan, N of the template, L landmarks, k components; millimetres, y up, z forward.
 """
 

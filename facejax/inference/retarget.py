@@ -101,7 +101,7 @@ def prepare(
 
 
 def animate(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0, head: bool = False) -> jax.Array:
-    """Return vertices (..., T, N, 3) in mm of a face moved by displacements from neutral (..., T, 68, 3).
+    """Animate a prepared mesh of any topology: vertices (..., T, N, 3) in mm from displacements (..., T, 68, 3).
 
     With `head`, the rigid motion of the landmarks that are fixed to the skull (`schemes.Scheme.stable`) is applied to
     all vertices; without, pinned rims hold the head back. Raises `ValueError` as `landmarks_of` does.

@@ -52,7 +52,7 @@ def names(tree: Tree) -> dict[str, Any]:
 
 
 def save(path: str | os.PathLike[str], tree: Tree, *, metadata: dict[str, Any] | None = None) -> None:
-    """Write a tree of arrays and JSON-serialisable `metadata` to a file, atomically."""
+    """Save trained parameters, any tree of arrays, and JSON-serialisable `metadata` as safetensors, atomically."""
     path = Path(path)
     arrays = {name: np.asarray(leaf, order="C") for name, leaf in names(tree).items()}
     header = {_HEADER: json.dumps(metadata or {}, sort_keys=True)}

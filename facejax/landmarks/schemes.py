@@ -135,7 +135,7 @@ def by_count(count: int) -> Scheme:
 
 
 def common(source: int, target: int) -> tuple[Int32[np.ndarray, " C"], Int32[np.ndarray, " C"]]:
-    """Return indices (C,) into the schemes of `source` and of `target` landmarks, of the points that they share.
+    """Convert between landmark schemes, such as dlib's 68 and 51: return the indices (C,) of shared points in each.
 
     In the order of the source. 68 and 51 share 51; 68 and 83 share 47; 51 and 83 share 46; 66 shares 49 with 51 and 45
     with 83.

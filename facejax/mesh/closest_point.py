@@ -78,10 +78,10 @@ def surface(vertices: np.ndarray, faces: np.ndarray) -> Surface:
 def closest_points(
     surface: Surface, points: np.ndarray, *, normals: np.ndarray | None = None, normal_weight: float = 0.0
 ) -> Hits:
-    """Return the closest point of the surface to each of `points` (P, 3).
+    """Return the closest point of the surface to each of `points` (P, 3): triangle, barycentric weights, distance.
 
-    With their unit `normals` (P, 3), the triangle minimises distance + turn * (1 - cosine of the angle between the
-    normals): one that faces the other way counts as farther by twice `normal_weight`, in the unit of the vertices.
+    With their unit `normals` (P, 3), the triangle minimises distance + normal_weight * (1 - cosine of the angle between
+    the normals): one that faces the other way counts as farther by twice `normal_weight`, in the unit of the vertices.
     """
     points = np.asarray(points, np.float64)
     search = _Search(surface, points, None if normals is None else np.asarray(normals, np.float64), normal_weight)

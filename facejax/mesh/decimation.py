@@ -8,9 +8,12 @@ fine vertex as a barycentric combination of three coarse ones.
 from __future__ import annotations
 
 import fast_simplification
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float32, Int32, Integer, Real
+from jaxtyping import Array, Float, Float32, Int32, Integer, Real
 
+from facejax.geometry.sphere import AnyArray
 from facejax.mesh import closest_point, graph
 
 
@@ -55,6 +58,7 @@ def upsampling(
 ) -> tuple[Int32[np.ndarray, "N 3"], Float32[np.ndarray, "N 3"]]:
     """Return corners (N, 3) int32 and barycentric weights (N, 3) float32 of the closest points on a coarse mesh.
 
+    `upsample` applies them to values of the coarse mesh; the decoders' spiral convolutions include that step.
     Weights lie in [0, 1] and sum to 1. A vertex that is a coarse vertex has weights 1, 0, 0 in some order. The search
     is exact: a triangle is skipped only if its bounding sphere lies beyond a point already found. Of equally near
     triangles the first is taken, so that the tables of a hierarchy are reproducible.
@@ -78,3 +82,14 @@ def upsampling(
     # Weights of 1e-16 are rounding errors; without them a kept vertex maps to itself exactly.
     weights[weights < 1e-6] = 0
     return corners, weights / weights.sum(axis=1, keepdims=True)
+
+
+@jax.jit
+def upsample(
+    values: Float[AnyArray, "*lead M C"], corners: Integer[AnyArray, "N 3"], weights: Float[AnyArray, "N 3"]
+) -> Float[Array, "*lead N C"]:
+    """Upsample values (..., M, C) of a coarse mesh, such as a decoder's features, to the N vertices of the fine one.
+
+    `corners` and `weights` are those of `upsampling`, or of a level of `facejax.mesh.hierarchy`.
+    """
+    return jnp.einsum("nk,...nkc->...nc", jnp.asarray(weights), jnp.asarray(values)[..., jnp.asarray(corners), :])

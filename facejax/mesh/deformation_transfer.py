@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Integer, Real
 from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 HIGHEST = jax.lax.Precision.HIGHEST
@@ -112,6 +113,7 @@ class TransferTables(NamedTuple):
 
     faces: Integer[Array | np.ndarray, "F 3"]
     neighbours: Integer[Array | np.ndarray, "W N"]  # rows beyond a vertex's number of neighbours hold 0
+    component: Integer[Array | np.ndarray, " N"]  # number of the connected component of each vertex
     slot: Integer[Array | np.ndarray, "F 3 3"]  # of corner j among the neighbours of corner i, as an index into (W, N)
 
 
@@ -128,7 +130,10 @@ def transfer_tables(faces: Integer[np.ndarray, "F 3"], count: int) -> TransferTa
     neighbours[place, owner] = pattern.indices
     # The pattern's entries are sorted by row and column, so that a pair is found by one search.
     entry = np.searchsorted(owner * np.int64(count) + pattern.indices, rows * np.int64(count) + columns)
-    return TransferTables(faces, neighbours, (place[entry] * count + rows).reshape(-1, 3, 3).astype(np.int32))
+    component = csgraph.connected_components(pattern, directed=False)[1]
+    return TransferTables(
+        faces, neighbours, component, (place[entry] * count + rows).reshape(-1, 3, 3).astype(np.int32)
+    )
 
 
 @jax.jit
@@ -141,9 +146,11 @@ def transfer(
 ) -> Float[Array, "B N 3"]:
     """Return the source's fields (B, N, 3) transferred to the target, in the dtype of the target.
 
-    With A the target's system, the answer is f + A^-1 r, where r holds only the difference of the two faces'
-    gradients: the solve, which loses digits in float32, finds a correction instead of the whole field. On makehuman4d
-    float32 differs from float64 by 1e-5 mm. A triangle without area has no influence.
+    With A the target's system, the answer is f + v, A v = r, where r holds only the difference of the two faces'
+    gradients: the solve, which loses digits in float32, finds a correction instead of the whole field. Where all
+    vertices move, anchors are so weak that A is almost singular: v may be shifted. But gradients do not see a shift, so
+    that the anchors' mean of v is zero in every connected component; penalising that mean leaves v as it is and makes A
+    well conditioned. On makehuman4d float32 differs from float64 by 1e-5 mm. A triangle without area has no influence.
     """
     target = jnp.asarray(target)
     source, anchors, fields = (jnp.asarray(x, target.dtype) for x in (source, anchors, fields))
@@ -155,6 +162,11 @@ def transfer(
     i, j = tables.faces[:, :, None], tables.faces[:, None, :]
     dense = jnp.zeros((count, count), target.dtype).at[i, j].add(system)
     dense = dense.at[jnp.arange(count), jnp.arange(count)].add(anchors * areas.mean())
+    ones = jnp.ones_like(anchors)
+    total, members = (jax.ops.segment_sum(x, tables.component, count)[tables.component] for x in (anchors, ones))
+    shift = anchors * jnp.sqrt(members) / total
+    same = jnp.asarray(tables.component)[:, None] == tables.component
+    dense = dense + jnp.where(same, shift[:, None] * shift, 0)
     # A sum over neighbours by gathers: XLA's scatter of wide rows takes seconds on a CPU.
     weights = jnp.zeros(tables.neighbours.size, target.dtype).at[tables.slot].add(right)
     flat = jnp.moveaxis(fields, 1, 0).reshape(count, -1)

@@ -112,7 +112,9 @@ def load(path: str | os.PathLike[str] | None = None) -> Models:
 
 def save(path: str | os.PathLike[str], models: Models) -> None:
     """Write models to one safetensors file, with the metadata that `load` needs."""
-    tree: dict[str, Any] = {name: getattr(models, name) for name in ("face", "motion", "starts", "hierarchy", "decoder")}
+    tree: dict[str, Any] = {
+        name: getattr(models, name) for name in ("face", "motion", "starts", "hierarchy", "decoder")
+    }
     about = {**models.about, "labels": list(models.labels), "generator": generators.kind(models.motion)}
     about["decoder"] = S2D
     tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)

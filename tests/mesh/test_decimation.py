@@ -1,5 +1,7 @@
 """Decimation to subsets of the vertices; upsampling, compared with a search of all triangles."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -63,3 +65,20 @@ def test_upsampling_is_exact_for_affine_functions_of_a_flat_mesh():
     corners, weights = decimation.upsampling(fine, coarse, np.array([[0, 1, 2], [0, 2, 3]]))
     affine = coarse @ [2.0, -3.0, 0] + 7
     np.testing.assert_allclose(np.sum(weights * affine[corners], axis=1), fine @ [2.0, -3.0, 0] + 7, atol=1e-5)
+    values = coarse @ np.array([[2.0, 1], [-3, 0], [0, 5]])
+    found = decimation.upsample(np.stack([values, -values]).astype(np.float32), corners, weights)
+    expected = fine @ np.array([[2.0, 1], [-3, 0], [0, 5]])
+    np.testing.assert_allclose(found, [expected, -expected], atol=1e-5)
+
+
+def test_upsample_keeps_the_dtype_and_is_linear(dtype):
+    rng = np.random.default_rng(2)
+    corners, weights = rng.integers(0, 4, (9, 3)).astype(np.int32), rng.dirichlet(np.ones(3), 9).astype(dtype)
+    values = rng.normal(size=(2, 4, 5)).astype(dtype)
+    found = decimation.upsample(values, corners, weights)
+    assert found.dtype == dtype and found.shape == (2, 9, 5)
+    expected = sum(weights[:, k, None] * values[:, corners[:, k]] for k in range(3))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    weight = rng.normal(size=found.shape).astype(dtype)
+    slope = jax.grad(lambda x: jnp.sum(weight * decimation.upsample(x, corners, weights)))(jnp.asarray(values))
+    np.testing.assert_allclose(jnp.sum(slope * values), jnp.sum(weight * found), rtol=1e-4)

@@ -147,9 +147,7 @@ def on_face(params: GPMM, neutral: Float[Array | np.ndarray, "N 3"]) -> FaceStat
     if np.shape(neutral) != np.shape(params.face):
         raise ValueError(f"neutral: expected vertices {np.shape(params.face)}, got {np.shape(neutral)}")
     dtype = jnp.result_type(jnp.asarray(neutral), jnp.float32)
-    mean, components, variance = (
-        jnp.asarray(x, dtype) for x in (params.mean, params.components, params.variance)
-    )
+    mean, components, variance = (jnp.asarray(x, dtype) for x in (params.mean, params.components, params.variance))
     if params.prior.carried and len(components):
         anchors = deformation_transfer.anchor_weights(params.hold)
         fields = jnp.concatenate([mean[None], components])

@@ -156,7 +156,9 @@ def covariances(
     mean, components = np.asarray(params.mean, np.float64), np.asarray(params.components, np.float64)
     if params.prior.carried:
         anchors = deformation_transfer.anchor_weights(np.asarray(params.hold, np.float64))
-        transfer = deformation_transfer.DeformationTransfer(face, np.asarray(neutral), np.asarray(params.faces), anchors)
+        transfer = deformation_transfer.DeformationTransfer(
+            face, np.asarray(neutral), np.asarray(params.faces), anchors
+        )
         moved = transfer(np.concatenate([mean[None], components]))
         mean, components = moved[0], moved[1:]
     marks = components[:, at].reshape(len(components), -1)

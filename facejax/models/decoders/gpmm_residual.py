@@ -63,7 +63,7 @@ def apply(
     refined: bool = True,
     noise: ArrayLike | None = 0.0,
 ) -> Float[Array, "... N 3"]:
-    """Return vertex displacements of a prepared face from its landmark displacements.
+    """Return vertex displacements of a prepared face from its landmark displacements: the default decoder.
 
     Args:
       refined: add the residual decoder's output; without it the GPMM estimate alone, one matrix product.

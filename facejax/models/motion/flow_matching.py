@@ -100,7 +100,9 @@ def velocity(
     chart, weights = jax.lax.stop_gradient(params.chart), params.weights
     y, s = state
     scale = state_std(chart, start, end)
-    context = jnp.concatenate([_time_embedding(jnp.asarray(time, y.dtype)), weights["labels"][0, start], weights["labels"][1, end], pose])
+    context = jnp.concatenate(
+        [_time_embedding(jnp.asarray(time, y.dtype)), weights["labels"][0, start], weights["labels"][1, end], pose]
+    )
     centre = to_state(chart, tangent_pca.conditional_mean(chart, start, end, pose))[0]
     offset = (y - centre)[0, 0] / scale
     # Both the offset from the mean in standard deviations and y itself: the first saturates far from the mean.
