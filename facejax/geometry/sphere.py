@@ -8,7 +8,7 @@ Glossary
     u, v, w   tangent vectors at a point, of the same shape: inner(p, v) = 0.
 
 The last three axes are fixed; leading axes are free and broadcast. The maps are equations 3, 4 and 10 of
-Otberdout et al. 2023 ("Generating Complex 4D Expression Transitions by Learning Face Landmark Trajectories");
+Otberdout et al. 2023 ("Generating Multiple 4D Expression Transitions by Learning Face Landmark Trajectories");
 the angle is taken by atan2, which is accurate near 0 and near pi, where an arc cosine loses half the digits.
 
 Singular points. `exp` is smooth everywhere and `log` at the identity too; their series take over from a
