@@ -72,7 +72,7 @@ def project(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C
 
 @jax.jit
 def exp(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
-    """Return the point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
+    """Return the exponential (exp) map at p of a tangent vector v, a point: cos|v| p + sin|v| v/|v| (eq. 3).
 
     It has unit norm where v is tangent at p; `project` a vector that may not be.
     """
@@ -82,7 +82,7 @@ def exp(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) 
 
 @jax.jit
 def log(p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
-    """Return the tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
+    """Return the logarithm (log) map at p of a point q: the tangent vector of norm distance(p, q) to it (eq. 4)."""
     _check(p, q)
     along = _log(p, q)
     return _wide(along.scale) * _tangent(p, q, along)
@@ -146,7 +146,7 @@ def extrinsic_mean(qs: Float[AnyArray, "*lead K S L C"]) -> Float[Array, "*lead 
 def karcher_mean(
     qs: Float[AnyArray, "*lead K S L C"], *, steps: int = 100, tolerance: Real[ArrayLike, ""] | None = None
 ) -> Float[Array, "*lead S L C"]:
-    """Return the Fréchet mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3): of least summed squared distance.
+    """Return the Karcher (Fréchet) mean (..., T-1, L, 3) of points qs (..., K, T-1, L, 3): least sum of squared distances.
 
     From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
     `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole batch, or for
