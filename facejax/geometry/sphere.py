@@ -146,11 +146,11 @@ def extrinsic_mean(qs: Float[AnyArray, "*lead K S L C"]) -> Float[Array, "*lead 
 def karcher_mean(
     qs: Float[AnyArray, "*lead K S L C"], *, steps: int = 100, tolerance: Real[ArrayLike, ""] | None = None
 ) -> Float[Array, "*lead S L C"]:
-    """Return the Karcher (Fréchet) mean (..., T-1, L, 3) of points qs (..., K, T-1, L, 3): least sum of squared distances.
+    """Return the Karcher (Fréchet) mean (..., T-1, L, 3) of points qs (..., K, T-1, L, 3).
 
-    From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
-    `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole batch, or for
-    `steps` steps. The mean is unique when all points lie within pi/2 of one point. Gradients are exact in
+    It minimises the sum of squared distances. From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the
+    norm of that mean is at most `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole
+    batch, or for `steps` steps. The mean is unique when all points lie within pi/2 of one point. Gradients are exact in
     both modes: they come from the stationarity condition, not from the iterations.
     """
     _check_set(qs)
