@@ -34,7 +34,7 @@ WORKS = (
     Work("pca_fit", "220 principal components of the same", "", ("scikit-learn",)),
     Work("labels_to_meshes_b16", "labels to meshes, 16 requests of 30 x 3,260 vertices", "600 meshes/s"),
     Work("labels_to_meshes_b1", "one request", ""),
-    Work("labels_to_meshes_linear_b16", "16 requests by the linear answer alone, `refined=False`", ""),
+    Work("labels_to_meshes_linear_b16", "16 requests by the GPMM estimate alone, `refined=False`", ""),
     Work("labels_to_meshes_s2d_b16", "16 requests by S2D-Dec", ""),
     Work("fresh_process_empty_cache", "the first request of a new process, nothing cached", ""),
     Work("fresh_process_warm_cache", "the same, compilation cache warm", ""),
@@ -44,7 +44,7 @@ WORKS = (
     Work("s2d_step_devices", "S2D-Dec training step, batch 16, each core a device", "", ("one device",)),
     Work("corpus_devices", "512 motions of a corpus, each core a device", "", ("one device",)),
     Work("corpus_10000", "a corpus of 10,000 motions, with its index", ""),
-    Work("corpus_1000000", "a million of them, told from it", ""),
+    Work("corpus_1000000", "a million motions, extrapolated", ""),
 )
 
 

@@ -43,7 +43,7 @@ class Peer:
         return [*self.data, *jax.tree.leaves((tuple(self.chart), self.average, self.weights)), *moments]
 
     def expected(self, start, end, pose):
-        """`charts.expected` of a batch."""
+        """Return `tangent_pca.conditional_mean` of a batch."""
         mean = F.pad(self.chart.mean[start, end], (tangent_pca.SCALARS, 0))
         return mean + torch.bmm(pose[:, None], self.chart.gain[start])[:, 0]
 
@@ -54,7 +54,7 @@ class Peer:
 
 
 class Gan(Peer):
-    """`facejax.fit_motion.fit_gan`, without its optional terms."""
+    """Training of `facejax.training.recipes.fit_motion.fit_gan`, without its optional terms."""
 
     def __init__(self, state: loop.TrainState, held: Any, plan: GanPlan):
         super().__init__(state, held, plan)
@@ -120,7 +120,7 @@ class Gan(Peer):
 
 
 class Flow(Peer):
-    """`facejax.fit_motion.fit_flow`; states are (B, R + 1), which is the same sphere: it has a single step."""
+    """Training of `facejax.training.recipes.fit_motion.fit_flow`; states are (B, R + 1), without the axes of size 1."""
 
     def __init__(self, state: loop.TrainState, held: Any, plan: FlowPlan):
         super().__init__(state, held, plan)
@@ -195,7 +195,7 @@ def check(peer: Peer, advance: Callable, start: loop.TrainState, rows: np.ndarra
     for ways in ((state.params, start.params, peer.weights), (state.extra, start.extra, peer.average)):
         ours, before, theirs = map(_flat, ways)
         apart, gone = np.linalg.norm(theirs - ours), np.linalg.norm(ours - before)
-        assert apart < 0.02 * gone, f"the weights have gone {gone:.3g} and are {apart:.3g} apart"
+        assert apart < 0.02 * gone, f"the weights moved by {gone:.3g} and differ by {apart:.3g}"
 
 
 def _normals(key: jax.Array, count: int, width: int) -> jax.Array:

@@ -61,7 +61,7 @@ class Options:
     def mode(self) -> Mode:
         """Return the training length. Raises `ValueError` where both --quick and --paper are given."""
         if self.quick and self.paper:
-            raise ValueError("--quick and --paper exclude each other")
+            raise ValueError("--quick and --paper cannot be combined")
         return "quick" if self.quick else "paper" if self.paper else "default"
 
     def folder(self, out: Path | None = None) -> Path:

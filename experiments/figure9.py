@@ -6,7 +6,7 @@
 
 The upper rows show two chains of transitions on unseen people. The lower rows show the motion of one unseen person on
 two others: a recording of Live Link Face where one is given, else a performance of makehuman4d. Its landmarks are
-encoded as an SRVF, applied to the other face's neutral landmarks, and expanded to its mesh. With `--data`: three
+encoded as an SRVF, applied to the other face's neutral landmarks, and decoded to its mesh. With `--data`: three
 people of a dataset, chains of its labels, and the first label under which all three have recordings. Animations are
 written beside the picture as glTF.
 

@@ -195,7 +195,7 @@ def _recognition(config: Config, data: dataset.Dataset, direct: motions.Motions)
 
 
 def _selected(onsets: motions.Motions, wanted: set[tuple[int, int]], labels: int) -> np.ndarray:
-    """The pairs of onsets (P, 2) that `motion_examples.transitions` takes: nearest to the mean peaks."""
+    """Return the pairs of onsets (P, 2) that `data.transitions.transitions` selects: nearest to the mean peaks."""
     peaks = onsets.curves[:, -1]
     prototypes = augment.prototypes(peaks, onsets.end - 1, classes=labels - 1)
     chosen = augment.select(peaks, onsets.end - 1, prototypes, per_pair=transitions.TRANSITIONS_PER_PAIR, reuse=1).pairs

@@ -3,11 +3,11 @@
     python -m experiments.registration --publish
 
 Ten MakeHuman test people that the morphable model was not fitted to, remeshed to 2,000, 10,000 and 50,000 vertices
-and placed at random, with 68 landmarks or the seven that are easily set by hand. `whole` is the bare surface;
+and placed at random, with 68 landmarks or the seven that are easy to pick manually. `whole` is the bare surface;
 `damaged` has eight holes of 12 mm radius, noise of 0.3 mm on its vertices and of 1 mm on its landmarks; `unlike` is
 deformed by a smooth field of 3 mm, which takes it outside of the morphable model. The ground truth is known: the
 surface that the scan was sampled from, and the position of each template vertex on it. `carried` is the error of a
-motion of the true head (`mouth_open`) that is put on the template and transferred to the scan's vertices.
+motion of the true head (`mouth_open`) that is applied to the template and transferred to the scan's vertices.
 
 Expected distance to the true surface, face, 10,000 vertices, 68 landmarks: 0.102 mm whole, 0.136 damaged, 0.285
 unlike. Time: 9 minutes on 2 cores of an AMD EPYC; `--quick` evaluates one head in one size.

@@ -1,7 +1,7 @@
 """Specificity, diversity and coverage of generated and real transitions (OT23, Table 5 and figure 7).
 
 Specificity as in OT23, section 4.3: the mean distance per landmark of 64 samples of each of 39 transitions to the
-single held-out sample of that transition. A single sample is a matter of chance, and the distance has no scale of its
+single held-out sample of that transition. The distance to a single sample is noisy, and has no scale of its
 own; so real people are scored in place of generated ones, and the distance to all held-out motions, the distance to
 the nearest training motion (Davies), diversity, coverage and acceleration are given as well, at equal counts.
 Held-out people: the 20 test subjects and 120 of another population, their transitions not selected by prototypes.

@@ -3,7 +3,7 @@
     python -m experiments.table1 --publish
 
 Protocols on makehuman4d, level 3: `identity`, four folds over 100 people; `expression`, four folds over CoMA's twelve
-expressions; `test`, 20 people that no choice was based on. Landmarks are the true ones. Errors are given over all
+expressions; `test`, 20 people not used for any choice. Landmarks are the true ones. Errors are given over all
 vertices of the head and over the face region alone, since vertices of the scalp that never move lower the mean of
 every method. OT23's figures stand beside them, on other data. Each method chooses the weights of its priors by
 cross-validation within the training meshes, over people or expressions as the protocol does.
@@ -16,7 +16,7 @@ Expected on the test people, head: ridge 0.0449 mm, PCA-220 0.0471, GPMM ("carri
 0.0205, S2D-Dec 0.0951; S2D-Dec with `--paper` 0.0586. The residual decoder's error is 0.22x that of S2D-Dec after 12
 to 23 epochs and 0.35x that of S2D-Dec after 300; it also sees the neutral mesh, which S2D-Dec does not. The GPMM's
 factor over ridge (0.49x) favours the GPMM: levels 2 and 3 create expressions with the deformation transfer that it
-uses itself (see `experiments.nonlinearity`). Neural3DMM is undertrained here: it errs by 1.31 mm on people of its
+uses itself (see `experiments.nonlinearity`). Neural3DMM is undertrained here: its error is 1.31 mm on people of its
 training set (expression split). Time: 3 hours of training on one core of an AMD EPYC, 20 minutes of them for the
 linear methods; two processes on two cores halve it. S2D-Dec with `--paper`: 4 to 8 minutes per fold on an H200.
 """

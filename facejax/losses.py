@@ -46,7 +46,7 @@ def gradient_penalty(
         return jnp.asarray(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(slope)))
 
     squared = jax.vmap(squared_slope)(tau, real, fake, condition)
-    flat = squared == 0.0  # the branch is chosen before the root, so that its derivative never sees 1 / 0
+    flat = squared == 0.0  # the branch is chosen before the root, so that its derivative never divides by 0
     norm = jnp.where(flat, 0.0, jnp.sqrt(jnp.where(flat, 1.0, squared)))
     return jnp.mean(jnp.square(norm - 1.0))
 
@@ -152,7 +152,7 @@ def s2d(
 
     `paper`: beta1 * displacement_l1 + beta2 * weighted_l1 (Otberdout et al. 2023, 3.2). Both terms measure
     the same residual, so with weights of 1 this is (beta1 + beta2) times the first term alone. `reference`:
-    as in the authors' program: the two factors are swapped, and the weighted term is a sum over the
+    as in the authors' code: the two factors are swapped, and the weighted term is a sum over the
     vertices, so that it outweighs the other about N times. Raises `ValueError` for another reduction.
     """
     plain = displacement_l1(predicted, target)

@@ -67,7 +67,7 @@ def main() -> None:
     lines = {name: len(path.read_text("utf-8").splitlines()) for name, path in paths.items()}
     folders: dict[str, int] = {}
     for path in paths.values():
-        if path.name != "__init__.py":
+        if path.name not in ("__init__.py", "__main__.py"):
             folder = str(path.parent.relative_to(root))
             folders[folder] = folders.get(folder, 0) + 1
     arrows = {(name, target) for name, path in paths.items() for target in imports(name, path, set(paths))}

@@ -33,7 +33,7 @@ def run(command: Animate) -> None:
             return outputs.report(files, notes)
         motion = motion_sources.from_recording(recording, name=command.livelink.stem)
     elif command.expression is not None:
-        assert not isinstance(command.frames, str)  # `checks.check` has seen to it
+        assert not isinstance(command.frames, str)  # ensured by `checks.check`
         motion = motion_sources.from_expression(
             command.expression, frames=command.frames, whole=command.whole, weights=command.model
         )

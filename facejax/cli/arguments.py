@@ -203,7 +203,7 @@ class Prepare:
     meshes: int = 20_000
     """Number of meshes to store, drawn with a fixed seed; landmarks of all frames are stored."""
     workers: int | None = None
-    """Number of processes; default: one for each processor where there is much to read."""
+    """Number of processes; default: one per processor for large datasets."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -80,7 +80,7 @@ def check_fps(fps: float) -> None:
 def check_total_frames(samples: int, frames: Iterable[int]) -> None:
     """Raise `ValueError` where `samples` motions, whose transitions have `frames` each, exceed `MAX_FRAMES` in all."""
     if (total := samples * sum(frames)) > MAX_FRAMES:
-        raise ValueError(f"{samples} samples have {total} frames, expected up to {MAX_FRAMES}: take fewer, or --count")
+        raise ValueError(f"{samples} samples have {total} frames, expected up to {MAX_FRAMES}: use fewer, or --count")
 
 
 def check_output_folder(folder: Path) -> None:
@@ -107,7 +107,7 @@ def _generate(command: Generate) -> None:
             if getattr(command, name) != getattr(Generate, name):
                 raise ValueError(f"--{name} requires --count")
         if not names:
-            raise ValueError("--end is missing: the expression to arrive at; `facejax labels` lists them")
+            raise ValueError("--end is missing: the final expression; `facejax labels` lists them")
         if command.landmarks is not None and command.face is None:
             raise ValueError(f"--landmarks {command.landmarks} requires --face: the scan that they belong to")
     else:

@@ -14,7 +14,7 @@ from facejax.inference import corpus, pipeline
 
 def run(command: Generate) -> None:
     """Write what is missing of a corpus and print the path of its index."""
-    assert command.count is not None and not isinstance(command.frames, str)  # `checks.check` has seen to it
+    assert command.count is not None and not isinstance(command.frames, str)  # ensured by `checks.check`
     if command.distributed:
         runtime.join_distributed()
     runtime.configure()

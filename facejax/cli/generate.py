@@ -20,7 +20,7 @@ def run(command: Generate) -> None:
         from facejax.cli import corpus
 
         return corpus.run(command)
-    assert command.end is not None  # `checks.check` has seen to it
+    assert command.end is not None  # ensured by `checks.check`
     bound = None
     if command.landmarks is None or command.face is None:
         neutral, notes = inputs.read_neutral(command.face, command.model)

@@ -16,7 +16,6 @@ from typing import Any
 import tyro
 
 import facejax
-from facejax.cli import checks
 from facejax.cli.arguments import Animate, Command, Data, Demo, Fit, Generate, Labels, Register, View
 from facejax.io import errors
 
@@ -60,6 +59,8 @@ def _runner(module: str) -> Callable[[Any], None]:
     """Return a function that checks a command, then imports `facejax.cli.MODULE` and calls its `run`."""
 
     def run(command: Any) -> None:
+        from facejax.cli import checks  # imports NumPy, which `--help` does not need
+
         checks.check(command)
         importlib.import_module(f"facejax.cli.{module}").run(command)
 

@@ -1,6 +1,6 @@
 """Write animations in the requested formats; show progress on standard error; report files on standard output.
 
-Every file is written whole or not at all.
+Every file is written atomically.
 """
 
 from __future__ import annotations

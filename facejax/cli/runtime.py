@@ -46,7 +46,7 @@ def keep_memory() -> bool:
     """Let glibc's allocator keep freed memory; return whether it could be set.
 
     By default large arrays are unmapped when they are freed, and the next one's pages are faulted in and zeroed again,
-    which can take longer than the arithmetic: encoding 1,000 motions took 13 ms, and takes 3.4 ms so. At most 2 GB are
+    which can take longer than the arithmetic: encoding 1,000 motions takes 3.4 ms instead of 13. At most 2 GB are
     kept. For processes on a CPU, where arrays of some 10 MB come and go. Without glibc it does nothing. Arenas of
     other threads still return their memory: a single arena for all threads would keep that too, but PyTorch then took
     up to five times as long.
@@ -79,7 +79,7 @@ def join_distributed(*, patience: int = 20) -> None:
     process. One that joined and sends no heartbeat for `patience` seconds is lost, and ends the others.
 
     Raises:
-      ValueError: variables are missing, or are no host, port and numbers; no job was detected.
+      ValueError: variables are missing or malformed, or no job was detected.
     """
     values = [os.environ[name] for name in _JOB_VARIABLES if name in os.environ]
     if len(values) not in (0, len(_JOB_VARIABLES)) or not all(number.isdigit() for number in values[1:]):

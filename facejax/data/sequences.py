@@ -120,7 +120,7 @@ def block(sequences: Sequences, *, frames: int | None = None, tail: int = TAIL_F
       frames: entries of the block.
       tail: entries of the padding that count.
       masked: exclude the rest of the padding, and the final zero target of a sequence that was cut. Without it every
-        target counts, as in the paper, whose networks mostly learn to stand still.
+        target counts, as in the paper, whose networks mostly learn to predict zero motion.
 
     Raises:
       ValueError: `frames` is below 2 or `tail` negative.

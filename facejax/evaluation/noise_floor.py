@@ -2,7 +2,7 @@
 
 Two frames with nearly equal landmarks and different meshes show what no function of the landmarks can predict. The
 Gamma test (Stefansson et al. 1997) regresses half the squared difference of neighbours' meshes on the squared distance
-of their landmarks; the intercept estimates the variance that the landmarks leave open. Residuals of a good decoder take
+of their landmarks; the intercept estimates the variance unexplained by the landmarks. Residuals of a good decoder take
 the place of the meshes: what the landmarks do predict is removed, and the estimate has less variance.
 
 F frames, L landmarks, N vertices, P pairs; millimetres, on the host.

@@ -229,7 +229,7 @@ def _wendland_c2(xp: ModuleType, squared: Any) -> Any:
 
 
 # Signed so that phi is positive definite (for q with P'q = 0): smoothing then smooths. Default kernel and widths are
-# the best of `experiments.rbf_warp`, except that the Gaussian stays at 1: 1.25 is 2 % better with parted lips, and 50 %
+# the best of `experiments.rbf_warp`, except that the Gaussian stays at 1: 1.25 is 2 % better with split lips, and 50 %
 # worse without.
 KERNELS = {
     "gaussian": Kernel(_gaussian, 1.0, True),  # exp(-r^2 / 2)

@@ -8,7 +8,7 @@ Glossary
     u, v, w   tangent vectors at a point, of the same shape: inner(p, v) = 0.
 
 The last three axes are fixed; leading axes are free and broadcast. The maps are equations 3, 4 and 10 of
-Otberdout et al. 2023 ("Generating Complex 4D Expression Transitions by Learning Face Landmark Trajectories");
+Otberdout et al. 2023 ("Generating Multiple 4D Expression Transitions by Learning Face Landmark Trajectories");
 the angle is taken by atan2, which is accurate near 0 and near pi, where an arc cosine loses half the digits.
 
 Singular points. `exp` is smooth everywhere and `log` at the identity too; their series take over from a
@@ -72,7 +72,7 @@ def project(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C
 
 @jax.jit
 def exp(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
-    """Return the point (..., T-1, L, 3) reached from p along the tangent vector v: cos|v| p + sin|v| v/|v| (eq. 3).
+    """Return the exponential (exp) map at p of a tangent vector v, a point: cos|v| p + sin|v| v/|v| (eq. 3).
 
     It has unit norm where v is tangent at p; `project` a vector that may not be.
     """
@@ -82,7 +82,7 @@ def exp(p: Float[AnyArray, "*#lead S L C"], v: Float[AnyArray, "*#lead S L C"]) 
 
 @jax.jit
 def log(p: Float[AnyArray, "*#lead S L C"], q: Float[AnyArray, "*#lead S L C"]) -> Float[Array, "*lead S L C"]:
-    """Return the tangent vector (..., T-1, L, 3) at p that `exp` takes to q; its norm is distance(p, q) (eq. 4)."""
+    """Return the logarithm (log) map at p of a point q: the tangent vector of norm distance(p, q) to it (eq. 4)."""
     _check(p, q)
     along = _log(p, q)
     return _wide(along.scale) * _tangent(p, q, along)
@@ -146,11 +146,11 @@ def extrinsic_mean(qs: Float[AnyArray, "*lead K S L C"]) -> Float[Array, "*lead 
 def karcher_mean(
     qs: Float[AnyArray, "*lead K S L C"], *, steps: int = 100, tolerance: Real[ArrayLike, ""] | None = None
 ) -> Float[Array, "*lead S L C"]:
-    """Return the Fréchet mean (..., T-1, L, 3) of the points qs (..., K, T-1, L, 3): of least summed squared distance.
+    """Return the Karcher (Fréchet) mean (..., T-1, L, 3) of points qs (..., K, T-1, L, 3).
 
-    From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the norm of that mean is at most
-    `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole batch, or for
-    `steps` steps. The mean is unique when all points lie within pi/2 of one point. Gradients are exact in
+    It minimises the sum of squared distances. From the extrinsic mean, p moves to exp(p, mean log(p, qs)) until the
+    norm of that mean is at most `tolerance` (radians; by default 16 times the spacing of the dtype at 1) in the whole
+    batch, or for `steps` steps. The mean is unique when all points lie within pi/2 of one point. Gradients are exact in
     both modes: they come from the stationarity condition, not from the iterations.
     """
     _check_set(qs)

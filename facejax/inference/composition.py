@@ -185,8 +185,8 @@ def _transition(
     represented = tangent_pca.decode_pose(chart, pose, start)
     curve = srvf.decode(motion.q, motion.log_length, represented)
     progress = srvf.arc_length_fraction(motion.q)[:, None, None]
-    # No jump, and no motion where there was none: what separates the two starts fades along the path. A way home
-    # ends at neutral exactly, which no network can promise.
+    # The difference of the two start poses is faded out along the path, so that there is no jump. A transition to
+    # neutral ends at neutral exactly, which the network alone does not guarantee.
     curve = curve + (1 - progress) * (position - represented)
     return curve - jnp.where(end == 0, progress * curve[-1], 0), motion.log_seconds
 

@@ -232,7 +232,7 @@ def durations(models: Models, key: Array, labels: Sequence[str], *, rate: float 
     """Generate the natural number of frames of each transition at `rate` frames per second.
 
     Natural is what the training data has: in makehuman4d an onset is a random draw of 18 to 39 frames at 60 frames per
-    second, no measurement of people. The numbers belong to the first sample of the motion that `landmarks` generates
+    second, not measured on people. The numbers belong to the first sample of the motion that `landmarks` generates
     from the same key; pass them as its `frames`. Raises `ValueError` for a rate that is not positive, and for unknown
     labels.
     """

@@ -169,10 +169,10 @@ def _refine(
     count, here = len(start), start.copy()
     pairs = graph.edges(model.faces)
     rows = np.arange(len(pairs))
-    difference = sparse.csr_matrix(
+    difference = sparse.csr_array(
         (np.tile([1.0, -1.0], len(pairs)), (np.repeat(rows, 2), pairs.ravel())), (len(pairs), count)
     )
-    smooth = sparse.kron(difference.T @ difference, sparse.eye(3), format="csc")
+    smooth = sparse.kron(difference.T @ difference, sparse.eye_array(3), format="csc")
     pull = np.zeros(count)
     pull[at] = 1 / noise**2
     for stiff, far in zip(STIFFNESS, np.linspace(*MAX_DISTANCE, len(STIFFNESS)), strict=True):
@@ -181,9 +181,9 @@ def _refine(
         block = weight[:, None, None] * (normals[:, :, None] * normals[:, None, :] + TANGENTIAL_WEIGHT * np.eye(3))
         right = np.einsum("nij,nj->ni", block, match - start)
         right[at] += pull[at, None] * (marks - start[at])
-        data = sparse.block_diag(list(block + pull[:, None, None] * np.eye(3)), format="csc")
+        data = sparse.bsr_array((block + pull[:, None, None] * np.eye(3), np.arange(count), np.arange(count + 1)))
         # A small ridge keeps vertices that are neither matched nor connected.
-        system = data + stiff * smooth + 1e-4 * sparse.eye(3 * count, format="csc")
+        system = data + stiff * smooth + 1e-4 * sparse.eye_array(3 * count, format="csc")
         here = start + splu(system.tocsc()).solve(right.ravel()).reshape(count, 3)
     hits = closest_point.closest_points(scan, here)
     _, _, weight = _matches(here, model.faces, scan, MAX_DISTANCE[1])

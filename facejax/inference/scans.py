@@ -108,7 +108,7 @@ def fit(scan: Scan) -> registration.Registration:
         raise MeshError(f"{scan.name}: {error}") from error
     if found.matched.mean() < 0.2:
         raise MeshError(
-            f"{scan.name}: only {found.matched.mean():.0%} of the template matches: are the landmarks of this mesh?"
+            f"{scan.name}: only {found.matched.mean():.0%} of the template matches: do the landmarks belong to it?"
         )
     return found
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-_Object = dict[str, Any]  # of JSON in a file that may be hostile: nothing is known of its values
+_Object = dict[str, Any]  # JSON of an untrusted file: values may have any type
 _MAX_JSON_BYTES = 2**25  # a face with a minute of animation takes a quarter of a megabyte
 _MAX_COUNT = 2**23  # vertices, or corners of triangles
 _JSON, _BIN = 0x4E4F534A, 0x004E4942

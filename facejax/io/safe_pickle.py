@@ -1,6 +1,6 @@
 """A restricted unpickler for files of numbers, strings and NumPy arrays, such as those of VOCASET and FLAME.
 
-A pickle is a program. Only the functions that build NumPy arrays are allowed, replaced by versions that allocate no
+Pickles can execute code. Only the functions that build NumPy arrays are allowed, replaced by versions that allocate no
 more memory than the file has bytes; every other name is rejected before any code is executed.
 """
 

@@ -32,7 +32,7 @@ MOTION = 0.05  # mm, root mean square: vertices that move more than this are anc
 
 def gradient_operator(
     vertices: Real[np.ndarray, "N 3"], faces: Integer[np.ndarray, "F 3"]
-) -> tuple[sparse.csr_matrix, Float[np.ndarray, " F"]]:
+) -> tuple[sparse.csr_array, Float[np.ndarray, " F"]]:
     """Return the operator from vertex values (N,) to gradients per triangle (3F,), and the areas (F,).
 
     Raises `ValueError` for a triangle without area, on which no gradient is defined.
@@ -47,7 +47,7 @@ def gradient_operator(
     corners = [np.cross(unit, edge) / double for edge in (c - b, a - c, b - a)]
     rows = (3 * np.arange(len(faces))[:, None] + np.arange(3)).ravel()
     parts = [
-        sparse.csr_matrix((g.ravel(), (rows, np.repeat(faces[:, i], 3))), shape=(3 * len(faces), len(vertices)))
+        sparse.csr_array((g.ravel(), (rows, np.repeat(faces[:, i], 3))), shape=(3 * len(faces), len(vertices)))
         for i, g in enumerate(corners)
     ]
     return sum(parts[1:], parts[0]), double[:, 0] / 2
@@ -80,8 +80,8 @@ class DeformationTransfer:
             )
         self._source_gradient, _ = gradient_operator(source, faces)
         self._target_gradient, areas = gradient_operator(target, faces)
-        self._areas = sparse.diags(np.repeat(areas, 3))
-        self._anchors = sparse.diags(np.asarray(anchors) * areas.mean())
+        self._areas = sparse.diags_array(np.repeat(areas, 3))
+        self._anchors = sparse.diags_array(np.asarray(anchors) * areas.mean())
         normal = self._target_gradient.T @ self._areas @ self._target_gradient
         self._solve = splu((normal + self._anchors).tocsc()).solve
 

@@ -23,7 +23,7 @@ class Part(NamedTuple):
     vertices: (M, 3), or (T, M, 3) where it moves.
     faces: (K, 3) int.
     colour: (3,) or (M, 3).
-    gloss: 0 is matt, 1 is wet.
+    gloss: 0 is matt, 1 is glossy.
     """
 
     vertices: np.ndarray

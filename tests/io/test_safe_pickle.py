@@ -64,7 +64,7 @@ class Runs:
     [
         (lambda p: Runs(subprocess.call, ["touch", str(p)]), "(subprocess|commands).call"),
         (lambda p: Runs(eval, f"open({str(p)!r}, 'w')"), "(builtins|__builtin__).eval"),
-        (lambda p: Runs(open, str(p), "w"), "io.open"),
+        (lambda p: Runs(open, str(p), "w"), "_?io.open"),
         (lambda p: Runs(getattr, p, "touch"), "(builtins|__builtin__).getattr"),
         (lambda p: pathlib.PurePosixPath("a"), "pathlib.*PurePosixPath"),
         (lambda p: fractions.Fraction(1, 2), "fractions.Fraction"),

@@ -41,8 +41,8 @@ class Pattern(NamedTuple):
     furrows: tuple[Furrow, ...]
     owner: np.ndarray  # (F,) group of each triangle
     flesh: np.ndarray  # (N,) millimetres of bulge at full compression
-    to_vertices: sparse.csr_matrix  # (N, F) averages over a vertex's triangles
-    smooth: sparse.csr_matrix  # (N, N) averages over a vertex and its neighbours
+    to_vertices: sparse.csr_array  # (N, F) averages over a vertex's triangles
+    smooth: sparse.csr_array  # (N, N) averages over a vertex and its neighbours
 
 
 class Skin(NamedTuple):
@@ -174,19 +174,19 @@ def _response(compression: np.ndarray) -> np.ndarray:
     return np.tanh(STIFFNESS * folded * folded / (folded + SLACK))
 
 
-def _averaging(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+def _averaging(faces: np.ndarray, count: int) -> tuple[sparse.csr_array, sparse.csr_array]:
     rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    incidence = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, len(faces)))
+    incidence = sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=(count, len(faces)))
     neighbours = ((incidence @ incidence.T) > 0).astype(float)
     return _normalise_rows(incidence), _normalise_rows(neighbours)
 
 
-def _normalise_rows(matrix: sparse.csr_matrix) -> sparse.csr_matrix:
-    scale = sparse.diags(1 / np.asarray(matrix.sum(axis=1)).ravel())
-    return sparse.csr_matrix(scale @ matrix, dtype=np.float32)
+def _normalise_rows(matrix: sparse.csr_array) -> sparse.csr_array:
+    scale = sparse.diags_array(1 / np.asarray(matrix.sum(axis=1)).ravel())
+    return sparse.csr_array(scale @ matrix, dtype=np.float32)
 
 
-def _average(matrix: sparse.csr_matrix, values: np.ndarray) -> np.ndarray:
+def _average(matrix: sparse.csr_array, values: np.ndarray) -> np.ndarray:
     """Apply an operator (A, B) to values (T, B): (T, A)."""
     return (matrix @ values.T).T
 

@@ -2,7 +2,7 @@
 
 The paper (Otberdout et al. 2023, 3.1) does not specify the layers; these are the layers of the authors' 2022 program,
 with three changes: the last image has T-1 columns, the critic has no batch normalisation (which is unsound with a
-gradient penalty), and both networks know the log-length. The generator has 77 M weights at 19 labels; `width_divisor`
+gradient penalty), and both networks use the log-length. The generator has 77 M weights at 19 labels; `width_divisor`
 makes all layers narrower.
 
 The interface is that of `facejax.models.motion.motion3dgan`: one sample, `start` and `end` label indices. Images are

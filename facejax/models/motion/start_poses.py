@@ -1,6 +1,6 @@
 """Distribution of start poses: the peak poses from which a motion of a given label starts.
 
-A generator of motions is conditioned on the face that the motion starts from; OT23 names this as its limit (section 5),
+A generator of motions is conditioned on the face that the motion starts from; OT23 names this a limitation (section 5),
 and uses one mean peak for everybody. Peaks vary between people, and not as a Gaussian: a mouth is drawn to the left or
 to the right, never in between. So a peak is resampled from the training set, shrunk towards the mean and blurred such
 that mean and covariance are kept (the smoothed bootstrap of Silverman & Young 1987).

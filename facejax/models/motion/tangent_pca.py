@@ -201,7 +201,7 @@ def _pair_std(within: np.ndarray, pooled: np.ndarray, start: np.ndarray, end: np
     """Return standard deviations (K, K, R) of centred components (M, R) per label pair; pooled for rare pairs.
 
     Pairs differ: along the direction that separates a mouth drawn left from one drawn right, only pairs with such a
-    mouth vary at all, and a pooled deviation would give the others a motion that they never make.
+    mouth vary at all, and a pooled deviation would give the others motion that is absent from their data.
     """
     pair = np.asarray(start) * labels + np.asarray(end)
     count = np.bincount(pair, minlength=labels**2)

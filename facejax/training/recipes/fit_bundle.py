@@ -76,7 +76,7 @@ def check(data: dataset.Dataset) -> None:
     people = data.subjects("train")
     if len(data.vertices) == 0:
         raise ValueError(
-            f"{data.path}: holds landmarks alone, expected meshes (recipes.fit_motion trains on landmarks)"
+            f"{data.path}: contains only landmarks, expected meshes (recipes.fit_motion trains on landmarks)"
         )
     if len(people) < MIN_TRAIN_SUBJECTS:
         raise ValueError(f"{data.path}: {len(people)} training subjects, expected {MIN_TRAIN_SUBJECTS} or more")

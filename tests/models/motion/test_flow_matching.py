@@ -92,10 +92,16 @@ def test_a_field_of_zero_gives_the_source_and_the_source_is_the_gaussian(chart, 
 
 def test_more_steps_converge_and_a_key_decides(still):
     params = moving(still, 0.1)
-    draws = [flow_matching.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=count) for count in (2, 16, 256)]
-    errors = [float(sphere.distance(one.q, draws[-1].q)) for one in draws[:-1]]
-    # Of second order: eight times as many, 64 times less, in the end.
+    keys = jax.random.split(jax.random.key(3), 9)
+
+    def draw(steps):
+        return jax.vmap(lambda key: flow_matching.sample(params, key, 0, 1, 0 * POSE, steps=steps).q)(keys)
+
+    few, more, exact = (draw(steps) for steps in (2, 64, 256))
+    errors = [np.median(sphere.distance(q, exact)) for q in (few, more)]
+    # Of second order in the end; the median, since a field of random weights turns some paths about an antipode.
     assert errors[0] > 1e-3 and errors[1] < 0.1 * errors[0]
+    draws = [flow_matching.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2)]
     np.testing.assert_array_equal(
         flow_matching.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2).q, draws[0].q
     )
