@@ -15,7 +15,7 @@ Fields are (B, N, 3) on N vertices, in the unit of the vertices; F triangles.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 HIGHEST = jax.lax.Precision.HIGHEST
+Values = TypeVar("Values", np.ndarray, jax.Array)
 ANCHOR = 1e-4  # weight of a vertex that never moves
 MOTION = 0.05  # mm, root mean square: vertices that move more than this are anchored less
 
@@ -53,7 +54,7 @@ def gradient_operator(
     return sum(parts[1:], parts[0]), double[:, 0] / 2
 
 
-def anchor_weights(motion: Float[Array | np.ndarray, " N"]) -> Float[Array | np.ndarray, " N"]:
+def anchor_weights(motion: Values) -> Values:
     """Return anchor weights (N,) from how far vertices usually move (N,), root mean square in mm."""
     return ANCHOR / (1 + (motion / MOTION) ** 2)
 

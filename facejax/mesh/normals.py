@@ -23,7 +23,7 @@ SHORTEST = 1e-20  # a sum of normals times double areas that is no longer has no
 def vertex_normals(
     vertices: Float[AnyArray, "*lead N 3"], faces: Integer[AnyArray, "F 3"]
 ) -> Float[Array, "*lead N 3"]:
-    """Return the unit normals (..., N, 3) of vertices (..., N, 3) with triangles (F, 3).
+    """Return the area-weighted unit normals (..., N, 3) of vertices (..., N, 3) with triangles (F, 3); differentiable.
 
     A normal is 0 where the adjacent triangles have no area, where their normals cancel to rounding, and at a vertex
     without a triangle.

@@ -55,7 +55,7 @@ def init(key: Array, size: int, *, hidden: int = 128, layers: int = 3) -> Weight
 
 @jax.jit
 def forward(weights: Weights, x: Float[Array | np.ndarray, "T B D"]) -> Float[Array, "T B D"]:
-    """Run the LSTM over sequences of known inputs, by a scan per layer; the input product is outside of the scan."""
+    """Run the LSTM over a sequence of known inputs, by a scan per layer; the input product is outside of the scan."""
     signal = jnp.asarray(x)
     for row in weights["layers"]:
         signal = _layer(row, signal)

@@ -1,5 +1,7 @@
 """Deformation transfer: compared with a dense least-squares solution; fields whose transfer is known."""
 
+import jax
+import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
@@ -158,3 +160,48 @@ def test_faces_of_different_shapes_are_named(monkeypatch):
         DeformationTransfer(face(0), face(1)[1:], FACES, anchor_weights(MOVING))
     with pytest.raises(ValueError, match=r"anchors \(N,\), got .* and \(161,\)"):
         DeformationTransfer(face(0), face(1), FACES, anchor_weights(MOVING[1:]))
+
+
+@pytest.mark.parametrize("motion", [MOVING, np.where(np.arange(N) < 40, 0.0, 2.0)], ids=["free", "held"])
+def test_in_jax_it_is_that_of_the_host(dtype, motion):
+    """Also where all vertices move, and the anchors hardly determine a shift."""
+    source, target, fields, anchors = face(0), face(1), smooth(2, 3), anchor_weights(motion)
+    tables = deformation_transfer.transfer_tables(FACES, N)
+    found = deformation_transfer.transfer(*(x.astype(dtype) for x in (source, target)), tables, anchors, fields)
+    assert found.dtype == dtype
+    expected = DeformationTransfer(source, target, FACES, anchors)(fields)
+    np.testing.assert_allclose(found, expected, atol=2e-5 if dtype == np.float32 else 1e-10)
+
+
+def test_in_jax_parts_of_a_mesh_do_not_pull_each_other():
+    faces = np.concatenate([FACES, FACES + N])
+    source, target = (np.concatenate([face(seed), face(seed + 1) + 200]) for seed in (0, 2))
+    fields, anchors = smooth(2, 3), anchor_weights(MOVING)
+    moved = np.concatenate([fields, 2 * fields], axis=1)
+    tables = deformation_transfer.transfer_tables(faces, 2 * N)
+    found = deformation_transfer.transfer(
+        source.astype(np.float32), target.astype(np.float32), tables, np.tile(anchors, 2), moved
+    )
+    expected = DeformationTransfer(source, target, faces, np.tile(anchors, 2))(moved)
+    np.testing.assert_allclose(found, expected, atol=5e-5)
+
+
+def test_in_jax_faces_are_vectorised_and_gradients_are_exact():
+    source, targets, fields = face(0), np.stack([face(1), face(2)]), smooth(2, 2)
+    tables, anchors = deformation_transfer.transfer_tables(FACES, N), anchor_weights(MOVING)
+    with jax.enable_x64(True):
+        carry = lambda target: deformation_transfer.transfer(source, target, tables, anchors, fields)  # noqa: E731
+        each = [carry(target) for target in targets]
+        np.testing.assert_allclose(jax.vmap(carry)(targets), each, atol=1e-10)
+        total = jax.jit(lambda target: jnp.sum(jnp.sin(carry(target))))
+        slope, step = jax.grad(total)(targets[0]), field(5, N, 3)
+        along = (total(targets[0] + 1e-5 * step) - total(targets[0] - 1e-5 * step)) / 2e-5
+        np.testing.assert_allclose(np.sum(slope * step), along, rtol=1e-6)
+
+
+def test_in_jax_a_triangle_without_area_has_no_influence():
+    target = face(1)
+    target[FACES[0, 1]] = target[FACES[0, 0]]
+    tables = deformation_transfer.transfer_tables(FACES, N)
+    found = deformation_transfer.transfer(face(0), target, tables, anchor_weights(MOVING), smooth(2, 1))
+    assert np.isfinite(found).all()
