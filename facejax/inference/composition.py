@@ -23,6 +23,14 @@ from facejax.models.motion import generators, start_poses, tangent_pca
 REACH = 8  # frames on each side of a joint over which its correction decays
 
 
+class Noise(NamedTuple):
+    """Random numbers of which one motion is a deterministic function; or of many, with leading axes."""
+
+    choice: jax.Array  # () uniform in [0, 1), selects the peak at which the motion starts
+    blur: jax.Array  # (D,) standard normal, blurs that peak
+    transitions: jax.Array  # (P, n) standard normal, the generator's
+
+
 class Drawn(NamedTuple):
     """Generated transitions, before they are joined on one timeline."""
 
@@ -98,21 +106,43 @@ def draw(generator: generators.Generator, starts: start_poses.StartPoses, keys: 
 
     The first transition starts at a peak pose of its label, drawn from `starts`.
     """
-    chart = jax.lax.stop_gradient(generator.chart)
 
     def one(key: jax.Array) -> Drawn:
-        first_key, key = jax.random.split(key)
-        first = tangent_pca.decode_pose(chart, _start_pose(generator, starts, first_key, pairs[0, 0]), pairs[0, 0])
-
-        def transition(position: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
-            key, (start, end) = inputs
-            curve, log_seconds = _transition(generator, starts, chart, key, position, start, end)
-            return curve[-1], (curve, log_seconds)
-
-        _, drawn = jax.lax.scan(transition, first, (jax.random.split(key, len(pairs)), pairs))
-        return Drawn(*drawn)
+        return generate(generator, starts, sample_noise(generator, starts, key, len(pairs)), pairs)
 
     return jax.vmap(one)(keys)
+
+
+def sample_noise(
+    generator: generators.Generator, starts: start_poses.StartPoses, key: jax.Array, transitions: int
+) -> Noise:
+    """Draw the random numbers of one motion of some transitions."""
+    first_key, key = jax.random.split(key)
+    choice_key, blur_key = jax.random.split(first_key)
+    size, dtype = generators.noise_size(generator), generator.chart.mean.dtype
+    keys = jax.random.split(key, transitions)
+    return Noise(
+        jax.random.uniform(choice_key, (), dtype),
+        jax.random.normal(blur_key, starts.poses.shape[2:], dtype),
+        jax.vmap(lambda key: jax.random.normal(key, (size,), dtype))(keys),
+    )
+
+
+@jax.jit
+def generate(
+    generator: generators.Generator, starts: start_poses.StartPoses, noise: Noise, pairs: jax.Array
+) -> Drawn:
+    """Return the transitions between label pairs (P, 2) that belong to noise, as one sample: `draw` without a key."""
+    chart = jax.lax.stop_gradient(generator.chart)
+    first = tangent_pca.decode_pose(chart, _start_pose(generator, starts, noise, pairs[0, 0]), pairs[0, 0])
+
+    def transition(position: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
+        noise, (start, end) = inputs
+        curve, log_seconds = _transition(generator, starts, chart, noise, position, start, end)
+        return curve[-1], (curve, log_seconds)
+
+    _, drawn = jax.lax.scan(transition, first, (noise.transitions, pairs))
+    return Drawn(*drawn)
 
 
 @jax.jit
@@ -161,10 +191,10 @@ def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> n
 
 
 def _start_pose(
-    generator: generators.Generator, starts: start_poses.StartPoses, key: jax.Array, label: jax.Array
+    generator: generators.Generator, starts: start_poses.StartPoses, noise: Noise, label: jax.Array
 ) -> jax.Array:
     if generators.uses_start_pose(generator):
-        return start_poses.sample(starts, key, label)
+        return start_poses.generate(starts, noise.choice, noise.blur, label)
     # A generator without a start pose starts at the mean peak, as in the paper.
     return jnp.zeros_like(generator.chart.pose_scale)
 
@@ -173,13 +203,13 @@ def _transition(
     generator: generators.Generator,
     starts: start_poses.StartPoses,
     chart: tangent_pca.TangentPCA,
-    key: jax.Array,
+    noise: jax.Array,
     position: jax.Array,
     start: jax.Array,
     end: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     pose = start_poses.clip_to_distribution(starts, tangent_pca.encode_pose(chart, position, start), start)
-    motion = generators.sample(generator, key, start, end, pose)
+    motion = generators.generate(generator, noise, start, end, pose)
     if not generators.uses_start_pose(generator):
         return srvf.decode(motion.q, motion.log_length, position), motion.log_seconds
     represented = tangent_pca.decode_pose(chart, pose, start)

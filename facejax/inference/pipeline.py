@@ -16,7 +16,7 @@ topology.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,9 +29,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from facejax.inference import checks, composition
+from facejax.inference.composition import Noise
 from facejax.models import labels as label_names
 from facejax.models.bundle import Face, Labels, Models, Provenance, load, save
 from facejax.models.decoders import gpmm_residual, s2d_dec
+from facejax.models.motion import generators
 
 __all__ = [
     "FRAMES",
@@ -39,6 +41,7 @@ __all__ = [
     "Face",
     "Labels",
     "Models",
+    "Noise",
     "PreparedFace",
     "Provenance",
     "captions",
@@ -49,8 +52,10 @@ __all__ = [
     "load",
     "meshes",
     "motion",
+    "motion_from_noise",
     "neutral_landmarks",
     "prepare",
+    "sample_noise",
     "save",
     "vertices",
 ]
@@ -112,36 +117,106 @@ def motion(
     Raises:
       ValueError: labels that are out of range or repeat, or an option out of range.
     """
-    if np.ndim(labels) < 1 or not jnp.issubdtype(jnp.result_type(labels), jnp.integer):
-        raise ValueError("labels: expected indices (..., K); `models.labels.encode` converts names")
-    if not isinstance(labels, Tracer):
-        for row in np.reshape(np.asarray(labels), (-1, np.shape(labels)[-1])):
-            composition.label_pairs(row, classes=len(models.labels))
-    if isinstance(intensity, float | int):
-        checks.check_intensity(intensity)
-    each = lengths(np.shape(labels)[-1] - 1, frames)
+    each = _check_motion(models, labels, frames, intensity)
     return _motion(models, key, labels, face, intensity, frames=each)
 
 
 @partial(jax.jit, static_argnames="frames")
 def _motion(
-    models: Models, key: Array, labels: Array, face: PreparedFace, intensity: ArrayLike, *, frames: tuple[int, ...]
+    models: Models,
+    key: Array,
+    labels: Array | np.ndarray,
+    face: PreparedFace,
+    intensity: ArrayLike,
+    *,
+    frames: tuple[int, ...],
 ) -> Array:
-    labels = jnp.asarray(labels)
-    lead = labels.shape[:-1]
+    noise = sample_noise(models, key, labels)
+    return _motion_from_noise(models, noise, labels, face, intensity, frames=frames)
+
+
+def _check_motion(models: Models, labels: Any, frames: int | Sequence[int], intensity: Any) -> tuple[int, ...]:
+    """Check what `motion` is given, as far as it is not traced; return the frames of each transition."""
+    if not isinstance(labels, Tracer):
+        numbers = np.asarray(labels)
+        if numbers.ndim < 1 or numbers.dtype.kind not in "iu":
+            raise ValueError(f"labels: expected indices (..., K), got {labels}; `models.labels.encode` converts names")
+        for row in numbers.reshape(-1, numbers.shape[-1]):
+            composition.label_pairs(row, classes=len(models.labels))
+    if isinstance(intensity, float | int):
+        checks.check_intensity(intensity)
+    return lengths(np.shape(labels)[-1] - 1, frames)
+
+
+def motion_from_noise(
+    models: Models,
+    noise: Noise,
+    labels: Int[Array | np.ndarray, "*lead K"],
+    face: PreparedFace,
+    *,
+    frames: int | Sequence[int] = FRAMES,
+    intensity: ArrayLike = 1.0,
+) -> Float[Array, "*lead T L 3"]:
+    """Return the landmark motion (..., T, L, 3) in mm that belongs to noise: `motion` without a key.
+
+    Differentiable in the noise of the transitions, and exportable where random keys do not exist.
+
+    Args:
+      noise: of `sample_noise`, with the leading axes of `labels`.
+      labels, frames, intensity: as in `motion`.
+
+    Raises:
+      ValueError: as `motion`, or noise of another shape.
+    """
+    each = _check_motion(models, labels, frames, intensity)
+    lead, count = np.shape(labels)[:-1], np.shape(labels)[-1] - 1
+    expected = Noise(lead, (*lead, models.starts.poses.shape[2]), (*lead, count, generators.noise_size(models.motion)))
+    if (found := Noise(*map(np.shape, noise))) != expected:
+        raise ValueError(f"noise: expected the shapes {expected}, got {found}; `sample_noise` draws it")
+    return _motion_from_noise(models, noise, labels, face, intensity, frames=each)
+
+
+def sample_noise(models: Models, key: Array, labels: Int[Array | np.ndarray, "*lead K"]) -> Noise:
+    """Draw the noise of the motion that `motion` generates from the same key and labels."""
+    lead, count = np.shape(labels)[:-1], np.shape(labels)[-1] - 1
+    return _map_leading(
+        lambda key: composition.sample_noise(models.motion, models.starts, key, count), lead, _keys(key, lead)
+    )
+
+
+@partial(jax.jit, static_argnames="frames")
+def _motion_from_noise(
+    models: Models,
+    noise: Noise,
+    labels: Array | np.ndarray,
+    face: PreparedFace,
+    intensity: ArrayLike,
+    *,
+    frames: tuple[int, ...],
+) -> Array:
+    def one(noise: Noise, labels: Array) -> Array:
+        pairs = jnp.stack([labels[:-1], labels[1:]], axis=-1)
+        curves = composition.generate(models.motion, models.starts, noise, pairs).curves[None]
+        matrix = composition.timeline(frames, drawn=curves.shape[2])
+        return composition.join(curves, jnp.asarray(matrix, curves.dtype))[0]
+
+    unitless = _map_leading(one, np.shape(labels)[:-1], noise, jnp.asarray(labels))
+    return face.landmarks + intensity * face.size * unitless
+
+
+def _keys(key: Array, lead: tuple[int, ...]) -> Array:
+    """Return one key for each element of the leading axes."""
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
         key = jax.random.wrap_key_data(key)
-    keys = key if key.shape == lead else jax.random.split(key, lead)
+    return key if key.shape == lead else jax.random.split(key, lead)
 
-    def one(key: Array, labels: Array) -> Array:
-        pairs = jnp.stack([labels[:-1], labels[1:]], axis=-1)
-        drawn = composition.draw(models.motion, models.starts, key[None], pairs)
-        matrix = composition.timeline(frames, drawn=drawn.curves.shape[2])
-        return composition.join(drawn.curves, jnp.asarray(matrix, drawn.curves.dtype))[0]
 
-    flat = jax.vmap(one)(keys.reshape(-1), labels.reshape(-1, labels.shape[-1])) if lead else one(keys, labels)
-    unitless = flat.reshape(*lead, *flat.shape[-3:])
-    return face.landmarks + intensity * face.size * unitless
+def _map_leading(function: Callable[..., Any], lead: tuple[int, ...], *arguments: Any) -> Any:
+    """Map a function over leading axes of its arguments, which all have them."""
+    if not lead:
+        return function(*arguments)
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[len(lead) :]), arguments)
+    return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), jax.vmap(function)(*flat))
 
 
 def vertices(

@@ -199,3 +199,16 @@ def test_wrong_arguments_are_named(models, neutrals):
         pipeline.motion(models, KEY, LABELS, face, intensity=3.0)
     with pytest.raises(ValueError, match=r"neutral: expected vertices \(162, 3\)"):
         pipeline.prepare(models, neutrals[0][1:])
+
+
+def test_motion_is_a_function_of_its_noise(models, neutrals):
+    face = pipeline.prepare(models, neutrals[0])
+    labels = np.array([[1, 0, 2], [0, 1, 0]])
+    noise = pipeline.sample_noise(models, KEY, labels)
+    found = pipeline.motion_from_noise(models, noise, labels, face, frames=FRAMES, intensity=0.5)
+    expected = pipeline.motion(models, KEY, labels, face, frames=FRAMES, intensity=0.5)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    slope = jax.grad(lambda x: jnp.sum(pipeline.motion_from_noise(models, x, labels, face, frames=FRAMES) ** 2))(noise)
+    assert np.abs(slope.transitions).max() > 0 and np.isfinite(slope.transitions).all()
+    with pytest.raises(ValueError, match=r"noise: expected the shapes Noise\(choice=\(\)"):
+        pipeline.motion_from_noise(models, noise, labels[0], face)

@@ -121,6 +121,18 @@ def sample_source(
 ) -> State:
     """Draw a state at time 0 from the Gaussian of a label pair and a pose, wrapped onto the sphere."""
     noise = jax.random.normal(key, (tangent_pca.SCALARS + len(chart.basis),), chart.mean.dtype)
+    return source(chart, noise, start, end, pose)
+
+
+@jax.jit
+def source(
+    chart: TangentPCA,
+    noise: Float[Array | np.ndarray, " coordinates"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
+) -> State:
+    """Return the state at time 0 that belongs to standard normal noise (2 + R,)."""
     return to_state(
         chart,
         tangent_pca.conditional_mean(chart, start, end, pose) + tangent_pca.conditional_std(chart, start, end) * noise,
@@ -147,24 +159,29 @@ def from_state(chart: TangentPCA, state: State, start: ArrayLike, end: ArrayLike
     return Motion(q, log_length, log_seconds)
 
 
+def noise_size(params: FlowMatching) -> int:
+    """Return the number of standard normal numbers that `generate` takes."""
+    return tangent_pca.SCALARS + len(params.chart.basis)
+
+
 @partial(jax.jit, static_argnames="steps")
-def sample(
+def generate(
     params: FlowMatching,
-    key: Array,
+    noise: Float[Array | np.ndarray, " coordinates"],
     start: ArrayLike,
     end: ArrayLike,
     pose: Float[Array | np.ndarray, " D"],
     *,
     steps: int = STEPS,
 ) -> Motion:
-    """Draw a motion between two labels that starts at a pose, by `steps` midpoint steps along the field.
+    """Return the motion of noise (2 + R,) between two labels from a pose, by `steps` midpoint steps along the field.
 
     Raises:
       ValueError: fewer than one step.
     """
     if steps < 1:
         raise ValueError(f"steps of integration: expected 1 or more, got {steps}")
-    state = sample_source(params.chart, key, start, end, pose)
+    state = source(params.chart, noise, start, end, pose)
 
     def advance(state: State, time: Array) -> tuple[State, None]:
         y, s = state

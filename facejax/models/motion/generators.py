@@ -23,6 +23,11 @@ KINDS = {
 }
 
 
+def noise_size(params: Generator) -> int:
+    """Return the number n of standard normal numbers that one motion is generated from."""
+    return _module(params).noise_size(params)
+
+
 @partial(jax.jit, static_argnames="steps")
 def sample(
     params: Generator,
@@ -46,9 +51,24 @@ def sample(
     Raises:
       TypeError: parameters that are not those of a generator.
     """
+    noise = jax.random.normal(key, (noise_size(params),), params.chart.mean.dtype)
+    return generate(params, noise, start, end, pose, steps=steps)
+
+
+@partial(jax.jit, static_argnames="steps")
+def generate(
+    params: Generator,
+    noise: Float[Array | np.ndarray, " n"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
+    *,
+    steps: int = flow_matching.STEPS,
+) -> Motion:
+    """Return the motion that belongs to standard normal noise (n,); otherwise as `sample`, and differentiable in it."""
     if isinstance(params, flow_matching.FlowMatching):
-        return flow_matching.sample(params, key, start, end, pose, steps=steps)
-    return _module(params).sample(params, key, start, end, pose)
+        return flow_matching.generate(params, noise, start, end, pose, steps=steps)
+    return _module(params).generate(params, noise, start, end, pose)
 
 
 def kind(params: object) -> str:

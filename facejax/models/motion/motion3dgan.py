@@ -164,12 +164,20 @@ generator = Network(_init_generator, _generate, _generate_coordinates)
 critic = Network(_init_critic, _criticise, _score)
 
 
+def noise_size(params: Motion3DGAN) -> int:
+    """Return the number of standard normal numbers that `generate` takes."""
+    return len(params.weights["skip"])
+
+
 @jax.jit
-def sample(
-    params: Motion3DGAN, key: Array, start: ArrayLike, end: ArrayLike, pose: Float[Array | np.ndarray, " D"]
+def generate(
+    params: Motion3DGAN,
+    noise: Float[Array | np.ndarray, " noise"],
+    start: ArrayLike,
+    end: ArrayLike,
+    pose: Float[Array | np.ndarray, " D"],
 ) -> Motion:
-    """Draw a motion between two labels that starts at a pose."""
-    noise = jax.random.normal(key, params.weights["skip"].shape[:1], params.weights["skip"].dtype)
+    """Return the motion of noise (128,) between two labels from a pose."""
     tangent, log_length, log_seconds = generator.apply(params, noise, start, end, pose)
     return Motion(sphere.exp(params.chart.p, tangent), log_length, log_seconds)
 

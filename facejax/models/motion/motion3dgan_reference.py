@@ -128,24 +128,24 @@ generator = Network(_init_generator, _generate)
 critic = Network(_init_critic, _criticise)
 
 
+def noise_size(params: Motion3DGANReference) -> int:
+    """Return the number of standard normal numbers that `generate` takes."""
+    # The stem's inputs less twice the two one-hot labels.
+    return params.weights["stem"]["kernel"].shape[0] - 4 * len(params.chart.scalar_mean)
+
+
 @jax.jit
-def sample(
+def generate(
     params: Motion3DGANReference,
-    key: Array,
+    noise: Float[Array | np.ndarray, " noise"],
     start: ArrayLike,
     end: ArrayLike,
     pose: Float[Array | np.ndarray, " D"] | None = None,
 ) -> Motion:
-    """Draw a motion between two labels. The pose is ignored, and the duration is the mean of the label pair."""
+    """Return the motion of noise (128,) between two labels. The pose is ignored, the duration the pair's mean."""
     del pose
-    noise = jax.random.normal(key, (_noise(params),), params.chart.p.dtype)
     tangent, log_length = generator.apply(params, noise, start, end)
     return Motion(sphere.exp(params.chart.p, tangent), log_length, params.chart.scalar_mean[start, end, 1])
-
-
-def _noise(params: Motion3DGANReference) -> int:
-    """Return the size of the noise: the stem's inputs less twice the two one-hot labels."""
-    return params.weights["stem"]["kernel"].shape[0] - 4 * len(params.chart.scalar_mean)
 
 
 def _sizes(rows: int, columns: int) -> list[tuple[int, int]]:

@@ -74,10 +74,23 @@ def clip_to_distribution(
 def sample(params: StartPoses, key: Array, label: ArrayLike) -> Float[Array, " D"]:
     """Draw the pose of a peak; zero for the label neutral."""
     which_key, blur_key = jax.random.split(key)
+    dtype = params.count.dtype
+    return generate(
+        params,
+        jax.random.uniform(which_key, (), dtype),
+        jax.random.normal(blur_key, params.poses.shape[2:], dtype),
+        label,
+    )
+
+
+@jax.jit
+def generate(
+    params: StartPoses, choice: ArrayLike, blur: Float[Array | np.ndarray, " D"], label: ArrayLike
+) -> Float[Array, " D"]:
+    """Return the pose of a peak that belongs to a number in [0, 1), which selects the peak, and to normal noise (D,)."""
     count = params.count[label]
-    which = jnp.minimum(jnp.floor(jax.random.uniform(which_key, (), count.dtype) * count), count - 1).astype(jnp.int32)
+    which = jnp.minimum(jnp.floor(choice * count), count - 1).astype(jnp.int32)
     # Rows beyond the count are zero, so a plain sum gives the mean.
     mean = jnp.sum(params.poses[label], axis=0) / count
-    blur = params.root[label] @ jax.random.normal(blur_key, mean.shape, mean.dtype)
-    drawn = mean + (1 - BLUR**2) ** 0.5 * (params.poses[label, which] - mean) + BLUR * blur
+    drawn = mean + (1 - BLUR**2) ** 0.5 * (params.poses[label, which] - mean) + BLUR * (params.root[label] @ blur)
     return jnp.where(jnp.asarray(label) == 0, 0.0, drawn)

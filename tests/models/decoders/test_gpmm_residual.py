@@ -105,9 +105,9 @@ def test_a_face_may_be_traced_and_differentiated(params, person):
         return gpmm_residual.apply(params, gpmm_residual.prepare(params, face), marks)
 
     expected = decode(neutral, marks[:3])
-    np.testing.assert_allclose(jax.jit(decode)(neutral, marks[:3]), expected, atol=2e-5)
+    np.testing.assert_allclose(jax.jit(decode)(neutral, marks[:3]), expected, atol=2e-4)
     faces = np.stack([neutral, neutral + 1])
-    np.testing.assert_allclose(jax.vmap(decode, (0, None))(faces, marks[:3])[0], expected, atol=2e-5)
+    np.testing.assert_allclose(jax.vmap(decode, (0, None))(faces, marks[:3])[0], expected, atol=2e-4)
     slope = jax.grad(lambda face: jnp.sum(decode(face, marks[:2]) ** 2))(neutral)
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 
 from facejax import losses
 from facejax.geometry import sphere
-from facejax.models.motion import flow_matching, tangent_pca
+from facejax.models.motion import flow_matching, generators, tangent_pca
 from facejax.training import loop, steps
 from tests.models.motion.test_motion3dgan import POSE, fitted, plain_weights, toy
 
@@ -78,7 +78,7 @@ def test_a_field_of_zero_gives_the_source_and_the_source_is_the_gaussian(chart, 
     @jax.vmap
     def draw(key):
         source = flow_matching.from_state(chart, flow_matching.sample_source(chart, key, 2, 1, POSE), 2, 1)
-        drawn = flow_matching.sample(still, key, 2, 1, POSE, steps=2)
+        drawn = generators.sample(still, key, 2, 1, POSE, steps=2)
         return source, drawn, tangent_pca.encode(chart, sphere.log(chart.p, drawn.q), *drawn[1:], 2, 1)
 
     source, drawn, got = draw(jax.random.split(jax.random.key(1), 3000))
@@ -95,17 +95,17 @@ def test_more_steps_converge_and_a_key_decides(still):
     keys = jax.random.split(jax.random.key(3), 9)
 
     def draw(steps):
-        return jax.vmap(lambda key: flow_matching.sample(params, key, 0, 1, 0 * POSE, steps=steps).q)(keys)
+        return jax.vmap(lambda key: generators.sample(params, key, 0, 1, 0 * POSE, steps=steps).q)(keys)
 
     few, more, exact = (draw(steps) for steps in (2, 64, 256))
     errors = [np.median(sphere.distance(q, exact)) for q in (few, more)]
     # Of second order in the end; the median, since a field of random weights turns some paths about an antipode.
     assert errors[0] > 1e-3 and errors[1] < 0.1 * errors[0]
-    draws = [flow_matching.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2)]
+    draws = [generators.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2)]
     np.testing.assert_array_equal(
-        flow_matching.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2).q, draws[0].q
+        generators.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2).q, draws[0].q
     )
-    other = flow_matching.sample(params, jax.random.key(4), 0, 1, 0 * POSE, steps=2)
+    other = generators.sample(params, jax.random.key(4), 0, 1, 0 * POSE, steps=2)
     assert float(sphere.distance(other.q, draws[0].q)) > 1e-2
 
 

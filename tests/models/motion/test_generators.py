@@ -34,7 +34,8 @@ def test_the_type_of_the_parameters_decides(made, name):
     params = made[name]
     steps = {"steps": 2} if name == "flow" else {}
     found = generators.sample(params, KEY, 1, 2, POSE, steps=2)
-    own = MODULES[name].sample(params, KEY, 1, 2, POSE, **steps)
+    noise = jax.random.normal(KEY, (generators.noise_size(params),))
+    own = MODULES[name].generate(params, noise, 1, 2, POSE, **steps)
     for a, b in zip(found, own, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert found.q.shape == SHAPE and abs(float(sphere.norm(found.q)) - 1) < 1e-5
