@@ -24,7 +24,7 @@ import jax
 
 from benchmarks import _measure, _sizes
 from facejax.inference import pipeline
-from facejax.models.decoders import gpmm, s2d_dec
+from facejax.models.decoders import s2d_dec
 
 LABELS, FRAMES = ["neutral", "high_smile"], 30
 FRESH = """
@@ -61,7 +61,7 @@ def run(config: Config) -> _measure.Found:
             name = f"labels_to_meshes{way}_b{samples}"
             rows.append(_measure.row(name, sides, repeats=repeats, items=count, unit="meshes"))
     neutral = models.face.vertices
-    rows.append(_measure.row("new_face", {"facejax": lambda: gpmm.linear_map(models.decoder.base, neutral)}, repeats=5))
+    rows.append(_measure.row("new_face", {"facejax": lambda: pipeline.prepare(models, neutral)}, repeats=5))
     with tempfile.TemporaryDirectory() as folder:
         for name in ("fresh_process_empty_cache", "fresh_process_warm_cache"):
             seconds = _fresh(folder)

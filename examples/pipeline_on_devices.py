@@ -19,7 +19,7 @@ import tyro
 
 import facejax
 from facejax.inference import composition, pipeline
-from facejax.models.decoders import gpmm, linear
+from facejax.models.decoders import linear
 from facejax.training import sharding
 
 LABELS = ("neutral", "high_smile", "mouth_open", "anger", "surprise")  # every motion starts at the first of them
@@ -50,8 +50,8 @@ def main(out: Path | None = None, steps: int = 60, seed: int = 0) -> dict[str, f
     released = facejax.load()
     numbers = jnp.asarray(released.labels.encode(LABELS))
     rest = released.face.vertices[released.face.landmark_index]
-    # Computed once for a face, on the host: its linear map from landmarks to vertices, of which 50 are used.
-    whole = gpmm.linear_map(released.decoder.base, released.face.vertices)
+    # Computed once for a face: its linear map from landmarks to vertices, of which 50 are used.
+    whole = pipeline.prepare(released, released.face.vertices).decoder.map
     chosen = np.random.default_rng(seed).choice(np.flatnonzero(released.face.mask), SEEN, replace=False)
     factor = np.asarray(whole.factors[0]).reshape(3 * len(rest), -1, 3)[:, chosen].reshape(3 * len(rest), -1)
     seen = linear.LinearMap(whole.landmark_mean, whole.vertex_mean[chosen], (jnp.asarray(factor),))

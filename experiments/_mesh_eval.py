@@ -179,7 +179,11 @@ def _about(name: str, model: Any, options: baselines.Options) -> dict[str, Any]:
     if name in ("gpmm", "gpmm_found"):
         return dataclasses.asdict(model.params.prior)
     if name == "s2d_residual":
-        return {**dataclasses.asdict(model.base.prior), "gate": float(model.network.gate), "steps": options.residual.steps}
+        return {
+            **dataclasses.asdict(model.base.prior),
+            "gate": float(model.network.gate),
+            "steps": options.residual.steps,
+        }
     return {"s2d": {"steps": options.decoder.steps}, "neural3dmm": {"steps": options.neural3dmm.steps}}.get(name, {})
 
 

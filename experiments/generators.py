@@ -186,7 +186,7 @@ def _train(config: Config, name: str, seed: int, data, examples, lent: pipeline.
         eighth = motion3dgan_reference.Config(width_divisor=8)
         generator = fit_motion.fit_reference(known, chart, folder, plan=plan, config=eighth, seed=seed)
     beginnings = transitions.fit_start_poses(chart, motions.halves(data, "train"))
-    models = lent._replace(motion=generator, starts=beginnings)
+    models = lent.replace(motion=generator, starts=beginnings)
     # Of the training steps alone, over all runs: compilation and preparation are the same for all variants.
     seconds = 0.0 if kind == "gaussian" else sum(row["seconds"] for row in metric_logger.read(folder))
     about = {"variant": name, "seed": seed, "seconds": seconds}

@@ -33,7 +33,7 @@ from facejax.evaluation import vertex_error
 from facejax.inference import pipeline
 from facejax.io import cache
 from facejax.mesh import hierarchy as mesh_hierarchy
-from facejax.models import bundle
+from facejax.models import bundle, model_file
 from facejax.models.decoders import s2d_dec
 from facejax.models.motion import generators
 from facejax.training.recipes import fit_gpmm, fit_motion, fit_residual, fit_s2d_dec
@@ -59,7 +59,7 @@ class Config:
     """Kind of motion generator."""
     motion_steps: int | None = None
     """Number of training steps of the generator; by default that of its plan."""
-    meshes_by: Literal["refined", "s2d"] = bundle.REFINED
+    meshes_by: Literal["refined", "s2d"] = model_file.REFINED
     """Decoder from landmarks to meshes: GPMM estimate plus residual decoder, or S2D-Dec."""
     decoder_steps: int | None = None
     """Number of training steps of the decoder; by default that of its plan."""
@@ -152,7 +152,7 @@ def _taken(path: Path, network: str) -> dict[str, Any]:
 
 
 def _plan(config: Config) -> fit_s2d_dec.S2DDecPlan | fit_residual.ResidualPlan:
-    plan = fit_s2d_dec.S2DDecPlan() if config.meshes_by == bundle.S2D else fit_residual.ResidualPlan()
+    plan = fit_s2d_dec.S2DDecPlan() if config.meshes_by == model_file.S2D else fit_residual.ResidualPlan()
     return plan if config.decoder_steps is None else plan._replace(steps=config.decoder_steps)
 
 
@@ -198,7 +198,7 @@ def _decoder(config: Config, data: dataset.Dataset, hierarchy):
         return pipeline.load(config.decoder).decoder, 0.0
     folder, train = config.out / config.meshes_by, of_split(data, "train")
     with _timed(folder) as seconds:
-        if config.meshes_by == bundle.S2D:
+        if config.meshes_by == model_file.S2D:
             found = fit_s2d_dec.fit(train, hierarchy, folder, plan=_plan(config), seed=config.seed)
         else:
             base = fit_gpmm.fit(train, components=bundle.COMPONENTS)

@@ -62,4 +62,6 @@ def in_float32(tree):
 
 def cast(tree, dtype):
     """Return the tree with its floating leaves in a dtype."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x, tree)
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, dtype) if jnp.issubdtype(jnp.result_type(x), jnp.floating) else x, tree
+    )

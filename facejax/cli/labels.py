@@ -8,6 +8,7 @@ from pathlib import Path
 
 from facejax.cli.arguments import Labels
 from facejax.io import weights
+from facejax.models import model_file
 
 MODELS = "makehuman4d.safetensors"  # `models.bundle.RELEASED`, which cannot be imported without JAX
 EXPRESSIONS = "expressions.safetensors"  # `inference.expressions.RELEASED`
@@ -20,10 +21,7 @@ def read_labels(path: str | os.PathLike[str] | None = None, *, released: str = M
       WeightsError: the file is missing, damaged, or has no labels.
     """
     path = Path(str(resources.files("facejax.assets").joinpath(released))) if path is None else path
-    found = weights.load_metadata(path).get("labels")
-    if not isinstance(found, list) or not all(isinstance(name, str) for name in found):
-        raise weights.WeightsError(f"{path} does not describe facejax models ('labels')")
-    return tuple(found)
+    return model_file.read_labels(path, weights.load_metadata(path))
 
 
 def run(command: Labels) -> None:

@@ -21,7 +21,7 @@ from jax.typing import DTypeLike
 
 from facejax.inference import checks
 from facejax.io import weights
-from facejax.models import expression_lstm
+from facejax.models import expression_lstm, model_file
 
 RELEASED = "expressions.safetensors"
 STOP = 0.01  # an expression has ended when its energy falls below this fraction of the maximum
@@ -42,15 +42,43 @@ def load(path: str | os.PathLike[str] | None = None) -> Expressions:
     """Read the released networks, or those of a file. Raises `weights.WeightsError`."""
     file: Any = path or resources.files("facejax.assets").joinpath(RELEASED)
     about = weights.load_metadata(file)
-    try:
-        config = expression_lstm.Config(**about["config"])
-        labels, rate, frames = tuple(about["labels"]), float(about["rate"]), int(about["frames"])
-        like = _structure(config, len(labels))
-    except (KeyError, TypeError, ValueError) as error:
-        raise weights.WeightsError(f"{file} does not describe expression networks ({error})") from error
+    labels, config, rate, frames = _check_metadata(file, about)
+    like = _structure(config, len(labels))
     tree, about = weights.load(file, like)
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
-    return Expressions(labels, params, config, rate, frames, about["about"])
+    return Expressions(labels, params, config, rate, frames, about.get("about", {}))
+
+
+def _check_metadata(file: Any, about: dict[str, Any]) -> tuple[tuple[str, ...], expression_lstm.Config, float, int]:
+    """Return labels, configuration, rate and frames. Raises `WeightsError` for a missing or invalid field."""
+
+    def refuse(field: str, expected: str, value: object) -> weights.WeightsError:
+        return weights.WeightsError(
+            f"{file} does not describe expression networks: field {field!r}: "
+            f"expected {expected}, got {repr(value)[:80]}"
+        )
+
+    labels = model_file.read_labels(file, about, least=1)
+    config: Any = about.get("config")
+    rate, frames = about.get("rate"), about.get("frames")
+    known = expression_lstm.Config._fields
+    if not isinstance(config, dict) or not config.keys() <= set(known):
+        raise refuse("config", f"a mapping with {', '.join(known)}", config)
+    for name, low, high in (("landmarks", 1, 10_000), ("hidden", 1, 10_000), ("layers", 1, 100)):
+        if name in config and not (type(config[name]) is int and low <= config[name] <= high):
+            raise refuse(f"config/{name}", f"a whole number from {low} to {high}", config[name])
+    if config.get("start", "zero") not in expression_lstm.STARTS:
+        raise refuse("config/start", f"one of {', '.join(expression_lstm.STARTS)}", config["start"])
+    carry, components = config.get("carry", 0.0), config.get("components")
+    if type(carry) not in (int, float) or not 0 <= carry <= 1:
+        raise refuse("config/carry", "a number from 0 to 1", carry)
+    if components is not None and not (type(components) is int and 1 <= components <= 30_000):
+        raise refuse("config/components", "a whole number from 1, or null", components)
+    if not isinstance(rate, int | float) or not 0 < rate <= 1000:
+        raise refuse("rate", "frames per second above 0, up to 1000", rate)
+    if type(frames) is not int or not 2 <= frames <= 100_000:
+        raise refuse("frames", "a whole number from 2 to 100000", frames)
+    return labels, expression_lstm.Config(**config), float(rate), frames
 
 
 def save(path: str | os.PathLike[str], networks: Expressions) -> None:

@@ -170,9 +170,9 @@ def motion_from_noise(
     """
     each = _check_motion(models, labels, frames, intensity)
     lead, count = np.shape(labels)[:-1], np.shape(labels)[-1] - 1
-    expected = Noise(lead, (*lead, models.starts.poses.shape[2]), (*lead, count, generators.noise_size(models.motion)))
-    if (found := Noise(*map(np.shape, noise))) != expected:
-        raise ValueError(f"noise: expected the shapes {expected}, got {found}; `sample_noise` draws it")
+    expected = (lead, (*lead, models.starts.poses.shape[2]), (*lead, count, generators.noise_size(models.motion)))
+    if (found := tuple(np.shape(leaf) for leaf in noise)) != expected:
+        raise ValueError(f"noise: expected arrays of shapes {expected}, got {found}; `sample_noise` draws it")
     return _motion_from_noise(models, noise, labels, face, intensity, frames=each)
 
 

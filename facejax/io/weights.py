@@ -22,7 +22,7 @@ from facejax.io import atomic, errors
 
 Tree = Any
 _HEADER = "facejax"
-_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(ml_dtypes.bfloat16)} | {
+DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(ml_dtypes.bfloat16)} | {
     f"{kind.upper()}{8 * size}": np.dtype(f"{kind}{size}")
     for kind in "fiu"
     for size in (1, 2, 4, 8)
@@ -111,7 +111,7 @@ def _shape_and_dtype(file: safe_open, name: str) -> Any:
     import jax
 
     part = file.get_slice(name)
-    return jax.ShapeDtypeStruct(tuple(part.get_shape()), _DTYPES.get(part.get_dtype(), np.dtype("V1")))
+    return jax.ShapeDtypeStruct(tuple(part.get_shape()), DTYPES.get(part.get_dtype(), np.dtype("V1")))
 
 
 def _open(path: str | os.PathLike[str]) -> safe_open:

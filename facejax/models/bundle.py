@@ -20,13 +20,13 @@ from flax import struct, traverse_util
 
 from facejax.io import weights
 from facejax.mesh import hierarchy as mesh_hierarchy
+from facejax.models import model_file
 from facejax.models.decoders import gpmm_residual, s2d_dec
 from facejax.models.labels import Labels
 from facejax.models.motion import generators, start_poses, tangent_pca
-from facejax.models.records import Leaf
+from facejax.models.records import HostLeaf
 
 RELEASED = "makehuman4d.safetensors"
-S2D, REFINED = "s2d", "refined"  # values of "decoder" in a file's metadata: S2D-Dec, or GPMM and residual decoder
 COMPONENTS = 200  # of the GPMM in a file; twice as many gain 0.001 mm and add 4 MB
 
 
@@ -36,7 +36,7 @@ class Provenance(Mapping[str, Any]):
     All provenances are equal, so that models that differ in nothing else share their compiled functions.
     """
 
-    def __init__(self, fields: Mapping[str, Any] = {}):  # noqa: B006  copied
+    def __init__(self, fields: Mapping[str, Any] = {}):
         self._fields = dict(fields)
 
     def __getitem__(self, name: str) -> Any:
@@ -64,11 +64,11 @@ class Provenance(Mapping[str, Any]):
 class Face(struct.PyTreeNode):
     """The mesh topology that the models were trained on."""
 
-    vertices: Leaf  # (N, 3) the mean neutral face of the population, mm
-    faces: Leaf  # (F, 3) triangles
-    landmark_index: Leaf  # (L,) vertices
-    source_index: Leaf  # (N,) vertices of MakeHuman's body; empty for another topology
-    mask: Leaf  # (N,) bool, the face region
+    vertices: HostLeaf  # (N, 3) the mean neutral face of the population, mm
+    faces: HostLeaf  # (F, 3) triangles
+    landmark_index: HostLeaf  # (L,) vertices
+    source_index: HostLeaf  # (N,) vertices of MakeHuman's body; empty for another topology
+    mask: HostLeaf  # (N,) bool, the face region
 
 
 class Models(struct.PyTreeNode):
@@ -87,19 +87,21 @@ def load(path: str | os.PathLike[str] | None = None) -> Models:
     """Read the released models, or those of a file.
 
     Raises:
-      WeightsError: a file that is missing, damaged or not a facejax model.
+      WeightsError: a file that is missing, damaged or not a facejax model; the message names the field.
     """
     path = path or str(resources.files("facejax.assets").joinpath(RELEASED))
     about = weights.load_metadata(path)
+    model_file.check_metadata(path, about)
     try:
         like = _structure(about["shapes"], about["generator"])
-    except (KeyError, TypeError) as error:
-        raise weights.WeightsError(f"{path} does not describe facejax models ({error})") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise weights.WeightsError(f"{path} does not describe facejax models: field 'shapes': {error}") from error
     tree, about = weights.load(path, like)
     tree.pop("props", None)
+    _check_indices(path, tree["face"])
     try:
         tree["hierarchy"] = mesh_hierarchy.load(tree["hierarchy"])
-        if about.get("decoder", S2D) == REFINED:
+        if about.get("decoder", model_file.S2D) == model_file.REFINED:
             tree["decoder"] = gpmm_residual.unpack(tree["decoder"], tree["hierarchy"], tree["face"].faces)
     except (ValueError, KeyError, TypeError) as error:
         raise weights.WeightsError(f"{path}: {error}") from error
@@ -116,13 +118,23 @@ def save(path: str | os.PathLike[str], models: Models) -> None:
         name: getattr(models, name) for name in ("face", "motion", "starts", "hierarchy", "decoder")
     }
     about = {**models.about, "labels": list(models.labels), "generator": generators.kind(models.motion)}
-    about["decoder"] = S2D
+    about["decoder"] = model_file.S2D
     tree["hierarchy"] = mesh_hierarchy.save(models.hierarchy)
     if isinstance(models.decoder, gpmm_residual.GPMMResidual):
-        about["decoder"] = REFINED
+        about["decoder"] = model_file.REFINED
         tree["decoder"] = gpmm_residual.pack(models.decoder, components=COMPONENTS)
     leaves = {name: (np.asarray(x).dtype.name, np.shape(x)) for name, x in weights.names(tree).items()}
     weights.save(path, tree, metadata=about | {"shapes": leaves})
+
+
+def _check_indices(path: str | os.PathLike[str], face: Face) -> None:
+    """Raise `WeightsError` for a triangle or a landmark of a vertex that does not exist, and for invalid positions."""
+    for name in ("faces", "landmark_index"):
+        index = np.asarray(getattr(face, name))
+        if index.dtype.kind not in "iu" or index.size == 0 or index.min() < 0 or index.max() >= len(face.vertices):
+            raise weights.WeightsError(f"{path}: face/{name}: expected indices of {len(face.vertices)} vertices")
+    if face.vertices.dtype.kind != "f" or not np.isfinite(face.vertices).all():
+        raise weights.WeightsError(f"{path}: face/vertices: expected finite numbers")
 
 
 def _structure(shapes: dict[str, list[Any]], generator: str) -> dict[str, Any]:

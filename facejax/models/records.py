@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     Leaf = jax.Array | np.ndarray
+    HostLeaf = np.ndarray  # of tables that stay on the host until a compiled function takes them
     Number = jax.Array | np.ndarray | float
 else:
     # JAX puts tracers, shapes, axes and placeholders into records: nothing may be checked where they are created.
-    Leaf = Number = Any
+    Leaf = HostLeaf = Number = Any

@@ -261,7 +261,7 @@ def test_compose_knows_its_labels_and_one_length_serves_all(made, beginnings):
     [
         (lambda: composition.label_pairs([1]), "a start and an end"),
         (lambda: composition.label_pairs([0, 1, 1]), "number 3 repeats the previous one"),
-        (lambda: composition.label_pairs(["neutral", "anger"]), "expected indices.*pipeline.label_indices"),
+        (lambda: composition.label_pairs(["neutral", "anger"]), "expected indices.*models.labels.encode"),
         (lambda: composition.label_pairs([0, -1]), "number 2 is -1, expected one from 0$"),
         (lambda: composition.label_pairs([0, 3], classes=3), "number 2 is 3, expected one from 0 to 2"),
         (lambda: composition.sample_keys(jax.random.key(0), 0), "samples must be 1 or more"),

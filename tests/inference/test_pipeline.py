@@ -7,7 +7,7 @@ import pytest
 from facejax.data.synthetic import expression_recipes, makehuman, makehuman4d, performance, rig
 from facejax.inference import pipeline
 from facejax.io import weights
-from facejax.models import bundle
+from facejax.models import model_file
 from facejax.models.decoders import s2d_dec
 from facejax.models.motion import generators, motion3dgan, motion3dgan_reference
 from tests.models.motion.test_motion3dgan import plain_weights
@@ -79,7 +79,7 @@ def test_s2d_dec_is_another_way_to_meshes(models, person, tmp_path):
     path = tmp_path / "s2d.safetensors"
     pipeline.save(path, models.replace(decoder=params))
     again = pipeline.load(path)
-    assert again.about["decoder"] == bundle.S2D and isinstance(again.decoder, s2d_dec.S2DDec)
+    assert again.about["decoder"] == model_file.S2D and isinstance(again.decoder, s2d_dec.S2DDec)
     marks = pipeline.landmarks(again, KEY, ["neutral", "anger"], person.vertices, frames=3)
     moved = marks - pipeline.neutral_landmarks(again, person.vertices)
     expected = person.vertices + np.asarray(s2d_dec.apply(params, models.hierarchy, moved))

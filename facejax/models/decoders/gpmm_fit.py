@@ -183,23 +183,3 @@ def _posterior(known: Covariances, prior: gpmm.Prior) -> tuple[np.ndarray, np.nd
     weight, noise = float(prior.smooth) ** 2, float(prior.noise)  # a loaded model's are arrays in float32
     within = known.within + weight * known.smooth_within + noise * np.eye(len(known.within))
     return within, known.cross + weight * known.smooth_cross
-
-
-def _learned(
-    params: gpmm.GPMM, neutral: Array | np.ndarray, vertex_index: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, on this face, the mean (N, 3), the covariance between landmarks, and that with the chosen vertices."""
-    statistics, at = params.statistics, params.landmark_index
-    if isinstance(statistics, linear.Moments):
-        cross = statistics.cross.reshape(len(statistics.cross), -1, 3)[:, vertex_index]
-        return statistics.vertex_mean, statistics.covariance, cross.reshape(len(cross), -1)
-    if isinstance(statistics, linear.LinearMap):
-        raise ValueError("this model file stores only a linear map, without covariances")
-    anchors = deformation_transfer.anchor_weights(params.hold)
-    transfer = deformation_transfer.DeformationTransfer(params.face, np.asarray(neutral), params.faces, anchors)
-    components = statistics.components.reshape(-1, *params.face.shape)
-    moved = transfer(np.concatenate([statistics.vertex_mean[None], components]))
-    mean, moved = moved[0], moved[1:]
-    marks = moved[:, at].reshape(len(moved), -1)
-    weighted = statistics.variance[:, None] * marks
-    return mean, weighted.T @ marks, weighted.T @ moved[:, vertex_index].reshape(len(moved), -1)

@@ -76,11 +76,10 @@ def apply(
     """
     marks = jnp.asarray(displacements, face.neutral.dtype)
     exact = isinstance(noise, float | int) and noise == 0
-    if noise is None:
-        noise = gpmm.estimate_landmark_noise(params.base, face.statistics, marks.reshape(-1, *marks.shape[-2:]))
     face_map = face.map
     if not exact:
-        face_map = gpmm.posterior_map(gpmm.with_landmark_noise(params.base, noise), face.statistics)
+        sigma = _estimate_noise(params, face, marks) if noise is None else noise
+        face_map = gpmm.posterior_map(gpmm.with_landmark_noise(params.base, sigma), face.statistics)
     base = linear.apply(face_map, marks)
     if not exact or not refined or base.size == 0:
         return base
@@ -88,6 +87,11 @@ def apply(
     flat = base.reshape(math.prod(lead), *base.shape[-2:])
     moved = refine(params, marks.reshape(len(flat), *marks.shape[-2:]), flat, face.neutral)
     return moved.reshape(base.shape)
+
+
+def _estimate_noise(params: GPMMResidual, face: PreparedFace, displacements: Array) -> Array:
+    flat = displacements.reshape(-1, *displacements.shape[-2:])
+    return gpmm.estimate_landmark_noise(params.base, face.statistics, flat)
 
 
 @jax.jit
@@ -167,7 +171,9 @@ def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: Int[np.ndarray, "F
     scale, network = tree["network"]["scale"], tree["network"]
     scale = residual.Scale(**scale) if isinstance(scale, dict) else scale
     return GPMMResidual(
-        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) if np.asarray(leaf).dtype.kind == "f" else leaf, model),
+        jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float32) if np.asarray(leaf).dtype.kind == "f" else leaf, model
+        ),
         jax.tree.map(jnp.asarray, residual.ResidualDecoder(scale, network["weights"], network["gate"])),
         jax.device_put(hierarchy),
         jax.device_put(strain.vertex_triangles(np.asarray(faces), len(face))),

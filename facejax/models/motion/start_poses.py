@@ -87,7 +87,7 @@ def sample(params: StartPoses, key: Array, label: ArrayLike) -> Float[Array, " D
 def generate(
     params: StartPoses, choice: ArrayLike, blur: Float[Array | np.ndarray, " D"], label: ArrayLike
 ) -> Float[Array, " D"]:
-    """Return the pose of a peak that belongs to a number in [0, 1), which selects the peak, and to normal noise (D,)."""
+    """Return the pose of the peak that a number in [0, 1) selects, blurred by standard normal noise (D,)."""
     count = params.count[label]
     which = jnp.minimum(jnp.floor(choice * count), count - 1).astype(jnp.int32)
     # Rows beyond the count are zero, so a plain sum gives the mean.

@@ -76,7 +76,9 @@ def fit(
     predictions = base.held_out(train)
     *_, (_, kept) = base.folds
     seen = np.setdiff1d(np.arange(train.count), kept)
-    scale = _measure(train.where(np.isin(np.arange(train.count), seen)), predictions[seen], base.params.face)
+    scale = _measure(
+        train.where(np.isin(np.arange(train.count), seen)), predictions[seen], np.asarray(base.params.face)
+    )
     init_key, run_key = jax.random.split(jax.random.key(seed))
     params = residual.init(init_key, hierarchy, scale)
 

@@ -116,7 +116,9 @@ def test_another_prior_is_that_of_a_fit_with_it(people):
     params, new = fit(people, True, 0.1, 1e-2, components=4), person(7)
     other = gpmm.Prior(True, 0.3, 1.0)
     found = gpmm_fit.predict(gpmm_fit.covariances(params, new.neutral), other, new.landmarks)
-    expected = linear.apply(gpmm.linear_map(fit(people, *dataclasses.astuple(other), components=4), new.neutral), new.landmarks)
+    expected = linear.apply(
+        gpmm.linear_map(fit(people, *dataclasses.astuple(other), components=4), new.neutral), new.landmarks
+    )
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 

@@ -93,9 +93,7 @@ def test_told_of_noise_it_trusts_landmarks_less(params, person):
         decode(params, marks[:0], neutral, noise=None)
     assert decode(params, marks[:0], neutral).shape == (0, *neutral.shape)
     with pytest.raises(ValueError, match="stores only a linear map fitted to noise-free landmarks"):
-        gpmm.with_landmark_noise(
-            params.base.replace(components=np.zeros((0, 162, 3)), variance=np.zeros(0)), 0.5
-        )
+        gpmm.with_landmark_noise(params.base.replace(components=np.zeros((0, 162, 3)), variance=np.zeros(0)), 0.5)
 
 
 def test_a_face_may_be_traced_and_differentiated(params, person):

@@ -102,9 +102,7 @@ def test_more_steps_converge_and_a_key_decides(still):
     # Of second order in the end; the median, since a field of random weights turns some paths about an antipode.
     assert errors[0] > 1e-3 and errors[1] < 0.1 * errors[0]
     draws = [generators.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2)]
-    np.testing.assert_array_equal(
-        generators.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2).q, draws[0].q
-    )
+    np.testing.assert_array_equal(generators.sample(params, jax.random.key(3), 0, 1, 0 * POSE, steps=2).q, draws[0].q)
     other = generators.sample(params, jax.random.key(4), 0, 1, 0 * POSE, steps=2)
     assert float(sphere.distance(other.q, draws[0].q)) > 1e-2
 
@@ -214,7 +212,7 @@ def test_the_flow_learns_both_styles(rank):
     state, _ = jax.jit(lambda s, i, h: jax.lax.scan(lambda s, b: step(s, b, h), s, i))(state, indices, held)
     params = flow_matching.FlowMatching(chart, state.params)
     keys = jax.random.split(jax.random.key(2), 1000)
-    drawn = jax.vmap(flow_matching.sample, (None, 0, None, None, None))(params, keys, 1, 2, 0 * POSE)
+    drawn = jax.vmap(generators.sample, (None, 0, None, None, None))(params, keys, 1, 2, 0 * POSE)
     tangents = sphere.log(chart.p, drawn.q)
     fake = jax.vmap(tangent_pca.encode, (None, 0, 0, 0, None, None))(chart, tangents, *drawn[1:], 1, 2)
     true = np.asarray(real[(start == 1) & (end == 2)])

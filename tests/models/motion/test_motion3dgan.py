@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 
 from facejax import losses
 from facejax.geometry import sphere
-from facejax.models.motion import motion3dgan, motion3dgan_reference, tangent_pca
+from facejax.models.motion import generators, motion3dgan, motion3dgan_reference, tangent_pca
 from facejax.training import loop, steps
 
 CONFIG = motion3dgan.Config(steps=5, landmarks=4, labels=3, noise=6, rank=8, pose=4, width=16, blocks=2, embedding=4)
@@ -194,7 +194,7 @@ def test_output_is_tangent_and_samples_have_unit_norm(generator):
     noise = 3.0 * jax.random.normal(jax.random.key(4), (50, CONFIG.noise))
     tangent, *_ = jax.vmap(motion3dgan.generator.apply, (None, 0, None, None, None))(generator, noise, 0, 2, 0 * POSE)
     assert np.abs(sphere.inner(generator.chart.p, tangent)).max() < 1e-6
-    q, log_length, log_seconds = jax.vmap(motion3dgan.sample, (None, 0, None, None, None))(generator, keys, 1, 0, POSE)
+    q, log_length, log_seconds = jax.vmap(generators.sample, (None, 0, None, None, None))(generator, keys, 1, 0, POSE)
     assert q.shape == (50, *SHAPE) and log_length.shape == (50,)
     np.testing.assert_allclose(sphere.norm(q), 1.0, atol=1e-5)
     assert len(np.unique(np.asarray(log_length))) == len(np.unique(np.asarray(log_seconds))) == 50

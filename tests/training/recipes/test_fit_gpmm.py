@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from facejax.data.mesh_subset import of_split
-from facejax.models.decoders import gpmm, linear
+from facejax.models.decoders import gpmm, gpmm_fit, linear
 from facejax.training.recipes import fit_gpmm
 
 COMPONENTS = 20
@@ -46,9 +46,9 @@ def test_the_simpler_is_taken_unless_the_better_is_worth_it(train, monkeypatch, 
 
 
 def test_what_is_fitted_is_the_model_of_all_meshes_under_that_prior(fitted, train, ball_store):
-    people = [gpmm.Person(*train.person(subject)) for subject in train.subjects]
+    people = [gpmm_fit.Person(*train.person(subject)) for subject in train.subjects]
     faces, at = ball_store.faces, ball_store.landmark_index
-    expected = gpmm.fit(people, faces, at, prior=fitted.params.prior, components=COMPONENTS)
+    expected = gpmm_fit.fit(people, faces, at, prior=fitted.params.prior, components=COMPONENTS)
     np.testing.assert_allclose(fitted.params.face, expected.face, rtol=1e-6)
     np.testing.assert_allclose(fitted.params.motion, expected.motion, rtol=1e-6)
     neutral, marks, vertices = of_split(ball_store, "test").person(1)

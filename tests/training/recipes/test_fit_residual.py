@@ -79,7 +79,7 @@ def distance(found, expected):
 
 def whole(fitted, train, answers, rows):
     """What the network says of meshes, all of it."""
-    opened = fitted._replace(network=fitted.network._replace(gate=jnp.ones(())))
+    opened = fitted.replace(network=fitted.network._replace(gate=jnp.ones(())))
     marks, vertices = train.read(rows)
     neutral = train.data.neutral[train.owner[rows]]
     return np.asarray(gpmm_residual.refine(opened, marks, answers[rows], neutral)), vertices
@@ -120,9 +120,10 @@ def test_on_a_new_face_it_refines_the_linear_answer_and_with_a_closed_gate_is_th
     _, fitted = refined
     neutral, marks, _ = of_split(ball_store, "test").person(1)
     linear_answer = np.asarray(linear.apply(gpmm.linear_map(fitted.base, neutral), marks))
-    closed = fitted._replace(network=fitted.network._replace(gate=jnp.zeros(())))
-    np.testing.assert_array_equal(gpmm_residual.apply(closed, marks, neutral), linear_answer)
-    found = np.asarray(gpmm_residual.apply(fitted, marks, neutral))
+    closed = fitted.replace(network=fitted.network._replace(gate=jnp.zeros(())))
+    face = gpmm_residual.prepare(fitted, neutral)
+    np.testing.assert_array_equal(gpmm_residual.apply(closed, face, marks), linear_answer)
+    found = np.asarray(gpmm_residual.apply(fitted, face, marks))
     rest = np.broadcast_to(neutral, linear_answer.shape)
     expected = residual.apply(fitted.network, fitted.hierarchy, fitted.tables, marks, linear_answer, rest)
     np.testing.assert_allclose(found, expected, atol=1e-4)
