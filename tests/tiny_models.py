@@ -1,4 +1,4 @@
-"""Small models for tests of the pipeline: 162 vertices, four landmarks, three labels; untrained, but nothing is zero."""
+"""Small models for tests of the pipeline: 162 vertices, four landmarks, three labels; untrained, nothing is zero."""
 
 import functools
 

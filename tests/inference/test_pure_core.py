@@ -195,7 +195,7 @@ def test_wrong_arguments_are_named(models, neutrals):
         models.labels.encode(["neutral", "smirk"])
     with pytest.raises(ValueError, match=r"landmarks: expected \(..., 4, 3\), got \(7, 5, 3\)"):
         pipeline.vertices(models, face, np.zeros((7, 5, 3)))
-    with pytest.raises(ValueError, match="intensity must lie in 0..2, got 3"):
+    with pytest.raises(ValueError, match=r"intensity must lie in 0\.\.2, got 3"):
         pipeline.motion(models, KEY, LABELS, face, intensity=3.0)
     with pytest.raises(ValueError, match=r"neutral: expected vertices \(162, 3\)"):
         pipeline.prepare(models, neutrals[0][1:])
