@@ -26,7 +26,7 @@ def distance(found, expected):
 
 def test_all_priors_are_tried_and_the_best_is_carried(fitted):
     wanted = {(kind, s, n) for kind in (False, True) for s in fit_gpmm.SMOOTHNESS_GRID for n in fit_gpmm.NOISE_GRID}
-    assert {tuple(prior) for prior in fitted.errors_mm} == wanted
+    assert {(p.carried, p.smooth, p.noise) for p in fitted.errors_mm} == wanted
     # Expressions of the balls are made by deformation transfer.
     assert fitted.params.prior.carried
     least = {kind: min(e for p, e in fitted.errors_mm.items() if p.carried == kind) for kind in (False, True)}
@@ -41,8 +41,8 @@ def test_the_simpler_is_taken_unless_the_better_is_worth_it(train, monkeypatch, 
     if wanted is None:
         assert error == min(found.errors_mm.values())
     else:
-        assert found.params.prior[:2] == wanted
-        assert error == min(e for prior, e in found.errors_mm.items() if prior[:2] == wanted)
+        assert (found.params.prior.carried, found.params.prior.smooth) == wanted
+        assert error == min(e for p, e in found.errors_mm.items() if (p.carried, p.smooth) == wanted)
 
 
 def test_what_is_fitted_is_the_model_of_all_meshes_under_that_prior(fitted, train, ball_store):
