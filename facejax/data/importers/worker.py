@@ -7,6 +7,7 @@ T frames, N vertices, L landmarks, S subjects, G stored meshes.
 from __future__ import annotations
 
 import concurrent.futures
+import functools
 import multiprocessing
 import os
 import signal
@@ -74,9 +75,9 @@ def import_all(job: Job, workers: int | None, progress: Callable[[int, int], Non
         return
     # Spawned, not forked: a fork of a process whose libraries run threads can hang.
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _start, (job,)) as pool:
+    with concurrent.futures.ProcessPoolExecutor(workers, context, _start) as pool:
         try:
-            for done, _ in enumerate(pool.map(_import, todo), 1):
+            for done, _ in enumerate(pool.map(functools.partial(import_recording, job), todo), 1):
                 progress(total - len(todo) + done, total)
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -180,12 +181,7 @@ def _result_path(job: Job, number: int) -> Path:
     return job.part / "done" / f"{number:06d}.npz"
 
 
-_job: Job | None = None  # of this process
-
-
-def _start(job: Job) -> None:
-    global _job
-    _job = job
+def _start() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it, and lets running recordings finish
     threading.Thread(target=_exit_with_parent, daemon=True).start()
 
@@ -196,8 +192,3 @@ def _exit_with_parent() -> None:
     assert parent is not None
     parent.join()
     os._exit(1)
-
-
-def _import(number: int) -> None:
-    assert _job is not None
-    import_recording(_job, number)
