@@ -47,6 +47,14 @@ def test_skeleton_wgan(tmp_path):
     assert found["nearest_recording_has_the_label"] > 0.6
 
 
+def test_fit_targets(tmp_path):
+    found = load("fit_targets").main(out=tmp_path, steps=12, frames=6)
+    assert found["after_mm"] < 0.6 * found["before_mm"] and 0 < found["intensity"] < 2
+    with np.load(tmp_path / "found.npz") as arrays:
+        assert arrays["misses_mm"].shape == (12, 3) and np.isfinite(arrays["vertices"]).all()
+    assert (tmp_path / "targets.png").is_file() and (tmp_path / "found.glb").is_file()
+
+
 def test_spiral_decoder(tmp_path):
     found = load("spiral_decoder").main(out=tmp_path, steps=40)
     assert found["decoder"] < 0.9 * found["training mean"]

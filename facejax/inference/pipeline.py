@@ -65,7 +65,7 @@ FRAMES = 30  # of a transition, as in the generator's training data
 
 
 class PreparedFace(struct.PyTreeNode):
-    """What the models need of one neutral face, computed once by `prepare`."""
+    """Everything that the models need of one neutral face, computed once by `prepare`."""
 
     neutral: Float[Array, "N 3"]  # mm
     landmarks: Float[Array, "L 3"]  # at rest, mm

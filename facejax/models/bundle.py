@@ -31,7 +31,7 @@ COMPONENTS = 200  # of the GPMM in a file; twice as many gain 0.001 mm and add 4
 
 
 class Provenance(Mapping[str, Any]):
-    """Where weights come from: command, commit, dataset, errors.
+    """Provenance of weights: command, commit, dataset, errors.
 
     All provenances are equal, so that models that differ in nothing else share their compiled functions.
     """

@@ -37,7 +37,7 @@ class GPMMResidual(struct.PyTreeNode):
 
 
 class PreparedFace(NamedTuple):
-    """What the decoder needs of one neutral face."""
+    """Everything that the decoder needs of one neutral face, computed once by `prepare`."""
 
     neutral: Float[Array, "N 3"]
     statistics: gpmm.FaceStatistics
