@@ -403,7 +403,7 @@ def test_pipeline(monkeypatch):
     rows, curves = checked(pipeline.run(pipeline.Config(quick=True, requests=(1,))))
     ways = ("", "_linear", "_s2d")
     fresh = {"fresh_process_empty_cache", "fresh_process_warm_cache"}
-    assert set(rows) == {*(f"labels_to_meshes{way}_b1" for way in ways), "new_face"} | fresh
+    assert set(rows) == {*(f"labels_to_meshes{way}_b1" for way in ways), "new_face", "sample_b64", "sample_b1"} | fresh
     assert not curves
 
 

@@ -145,9 +145,13 @@ def displacements(
 def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.ExpressionLSTM:
     """Return the tree of shapes and dtypes that a file holds."""
     size = config.landmarks * 3
-    basis = None if config.components is None else jnp.zeros((size, config.components))
-    scale = expression_lstm.Scale(jnp.ones(()), jnp.zeros((config.landmarks, 3)), jnp.ones(()), jnp.ones(()), basis)
-    one = jax.eval_shape(lambda: expression_lstm.init(jax.random.key(0), scale, config=config))
+
+    def make() -> expression_lstm.ExpressionLSTM:
+        basis = None if config.components is None else jnp.zeros((size, config.components))
+        scale = expression_lstm.Scale(jnp.ones(()), jnp.zeros((config.landmarks, 3)), jnp.ones(()), jnp.ones(()), basis)
+        return expression_lstm.init(jax.random.key(0), scale, config=config)
+
+    one = jax.eval_shape(make)  # a file's sizes are untrusted: nothing is allocated
 
     def stacked(dtype: DTypeLike) -> Callable[[jax.Array], jax.ShapeDtypeStruct]:
         return lambda leaf: jax.ShapeDtypeStruct((count, *leaf.shape), dtype)

@@ -1,6 +1,9 @@
 """prepare, motion and vertices as pure functions: every transformation of JAX, in any order, on tiny models."""
 
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +14,7 @@ from jax.sharding import PartitionSpec as P
 from facejax.inference import pipeline
 from tests import tiny_models
 
+ROOT = Path(__file__).parents[2]
 FRAMES = 4
 KEY = jax.random.key(7)
 
@@ -121,18 +125,33 @@ def test_inside_scan(models, neutrals):
     np.testing.assert_allclose(found, sum(pipeline.vertices(models, face, one) for one in each), atol=2e-4)
 
 
-def test_under_shard_map_on_several_devices(models, neutrals):
+def sharded(models, neutral):
+    """Compare motions and meshes computed on all devices with those of one."""
     devices = jax.devices()
     mesh = jax.make_mesh((len(devices),), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
     keys = jax.random.split(KEY, 2 * len(devices))
 
     def part(models, keys):
-        return jax.vmap(whole, (None, 0, None, None))(models, keys, LABELS, neutrals[0])
+        return jax.vmap(whole, (None, 0, None, None))(models, keys, LABELS, neutral)
 
-    found = jax.jit(jax.shard_map(part, mesh=mesh, in_specs=(P(), P("data")), out_specs=P("data"), check_vma=False))(
-        models, keys
-    )
+    specs = {"in_specs": (P(), P("data")), "out_specs": P("data"), "check_vma": False}
+    found = jax.jit(jax.shard_map(part, mesh=mesh, **specs))(models, keys)
+    assert len(found.sharding.device_set) == len(devices)
     np.testing.assert_allclose(found, part(models, keys), atol=5e-5)
+    return len(devices)
+
+
+def test_under_shard_map_on_four_devices():
+    script = (
+        "import jax; jax.config.update('jax_num_cpu_devices', 4)\n"
+        "from tests import tiny_models\n"
+        "from tests.inference import test_pure_core\n"
+        "models = tiny_models.make()\n"
+        "print(test_pure_core.sharded(models, models.face.vertices), 'devices')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["4", "devices"]
 
 
 def test_eight_threads_get_the_same(models, neutrals):
