@@ -399,7 +399,7 @@ def test_linear():
 
 
 def test_pipeline(monkeypatch):
-    monkeypatch.setattr(pipeline, "_fresh", lambda folder: 1.0)
+    monkeypatch.setattr(pipeline, "_fresh", lambda folder: (1.0, 500.0))
     rows, curves = checked(pipeline.run(pipeline.Config(quick=True, requests=(1,))))
     ways = ("", "_linear", "_s2d")
     fresh = {"fresh_process_empty_cache", "fresh_process_warm_cache"}
