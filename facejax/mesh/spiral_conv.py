@@ -122,7 +122,8 @@ def _joined(stencil: Stencil) -> Stencil:
 
 def _by_vertex(table: AnyArray) -> AnyArray:
     """Reshape (S, J, M) to (J, M * S)."""
-    return table.transpose(1, 2, 0).reshape(table.shape[1], -1)
+    positions, slots, vertices = table.shape
+    return table.transpose(1, 2, 0).reshape(slots, vertices * positions)
 
 
 def _sum_positions(
