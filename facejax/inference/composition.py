@@ -129,7 +129,9 @@ def sample_noise(
 
 
 @jax.jit
-def generate(generator: generators.Generator, starts: start_poses.StartPoses, noise: Noise, pairs: jax.Array) -> Drawn:
+def generate(
+    generator: generators.Generator, starts: start_poses.StartPoses, noise: Noise, pairs: jax.Array
+) -> Drawn:
     """Return the transitions between label pairs (P, 2) that belong to noise, as one sample: `draw` without a key."""
     chart = jax.lax.stop_gradient(generator.chart)
     first = tangent_pca.decode_pose(chart, _start_pose(generator, starts, noise, pairs[0, 0]), pairs[0, 0])

@@ -198,7 +198,7 @@ def continue_curve(
     time = jnp.arange(frames - 1)[:, None, None]
     given = jnp.where(time < known - 1, jnp.diff(jnp.asarray(curve), axis=-3), 0)
     # Entry t holds the step that led to frame t, as in a training block.
-    steps = jnp.concatenate([jnp.zeros_like(given[..., :1, :, :]), given[..., :-1, :, :]], axis=-3)
+    steps = jnp.where(time > 0, jnp.roll(given, 1, axis=-3), 0)
     made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
     made = jnp.where(time < known - 1, given, made)
     curve = jnp.cumsum(jnp.concatenate([jnp.zeros_like(made[..., :1, :, :]), made], axis=-3), axis=-3)
