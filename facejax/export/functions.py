@@ -66,6 +66,7 @@ class Function:
     params: Arrays  # arrays by name
     inputs: dict[str, Spec]
     outputs: tuple[str, ...]
+    constraints: tuple[str, ...] = ()  # on symbolic dimensions, such as "frames >= 2"
 
     @property
     def symbols(self) -> tuple[str, ...]:
@@ -76,7 +77,7 @@ class Function:
     def arguments(self, sizes: Mapping[str, int] | None = None) -> list[jax.ShapeDtypeStruct]:
         """Return shape and dtype of every input: with given sizes of all symbols, or symbolic ones of `jax.export`."""
         if sizes is None:
-            scope = export.SymbolicScope()
+            scope = export.SymbolicScope(self.constraints)
             shapes = [
                 export.symbolic_shape(",".join(map(str, spec.shape)), scope=scope) for spec in self.inputs.values()
             ]
@@ -215,7 +216,8 @@ def _lstm(networks: Expressions) -> Function:
         "known": Spec((), "int32"),
     }
     inputs |= {"neutral": Spec((BATCH, *points))} if from_neutral else {}
-    return _function("lstm", call, {"lstm": networks.params}, inputs, ("curve",))
+    found = _function("lstm", call, {"lstm": networks.params}, inputs, ("curve",))
+    return dataclasses.replace(found, constraints=("frames >= 2",))
 
 
 def _noise(models: Models) -> dict[str, Spec]:
