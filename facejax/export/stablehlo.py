@@ -15,15 +15,15 @@ import dataclasses
 import datetime
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jaxlib
 import numpy as np
 from jax import export as jax_export
 from jax.typing import ArrayLike
+from jaxlib import version as jaxlib_version
 
 import facejax
 from facejax.export import functions as catalogue
@@ -52,6 +52,7 @@ class LoadedFunction:
     outputs: dict[str, Spec]
     params: dict[str, Any]
     exported: jax_export.Exported
+    run: Callable[..., dict[str, jax.Array]]  # of params and inputs, compiled once for each set of shapes
 
     def __call__(self, **arrays: ArrayLike) -> dict[str, jax.Array]:
         """Return the outputs by name, shapes and dtypes as in `outputs`.
@@ -64,7 +65,7 @@ class LoadedFunction:
             raise ValueError(f"{self.name}: expected the inputs {', '.join(self.inputs)}; missing or unknown: {wrong}")
         converted = {name: _convert(name, arrays[name], spec.dtype) for name, spec in self.inputs.items()}
         _check_shapes(self.name, self.inputs, {name: np.shape(array) for name, array in converted.items()})
-        return self.exported.call(self.params, converted)
+        return self.run(self.params, converted)
 
 
 def export(
@@ -89,13 +90,14 @@ def export(
     """
     out = Path(os.path.abspath(out))
     manifest.check_folder(out)
-    if not platforms or (unknown := [name for name in platforms if name not in PLATFORMS]):
-        raise ValueError(f"platforms: expected some of {', '.join(PLATFORMS)}, got {', '.join(unknown) or 'none'}")
+    if not platforms or not set(platforms) <= set(PLATFORMS):
+        raise ValueError(f"platforms: expected some of {', '.join(PLATFORMS)}, got {', '.join(platforms) or 'none'}")
     if networks is None and (functions is None or "lstm" in functions):
         networks = expressions.load()
-    found = catalogue.catalogue(models, functions, networks=networks)
-    arrays = {name: np.asarray(array) for function in found.values() for name, array in function.params.items()}
-    with atomic.replace_folder(out) as temporary:
+    # Without x64: the functions are of float32.
+    with jax.enable_x64(False), atomic.replace_folder(out) as temporary:
+        found = catalogue.catalogue(models, functions, networks=networks)
+        arrays = {name: np.asarray(array) for function in found.values() for name, array in function.params.items()}
         weights.save(temporary / WEIGHTS, arrays)
         entries: dict[str, Any] = {}
         for name, function in found.items():
@@ -108,7 +110,7 @@ def export(
             "version": manifest.VERSION,
             "facejax": facejax.__version__,
             "jax": jax.__version__,
-            "jaxlib": jaxlib.__version__,
+            "jaxlib": jaxlib_version.__version__,
             "calling_convention_version": jax_export.maximum_supported_calling_convention_version,
             "platforms": list(platforms),
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
@@ -146,7 +148,8 @@ def load(folder: str | os.PathLike[str]) -> dict[str, LoadedFunction]:
         exported = _deserialise(path, index)
         expected = {key: Spec(like[key].shape, str(like[key].dtype)) for key in entry["params"]}
         _check_signature(path, exported, expected, inputs, outputs)
-        found[name] = LoadedFunction(name, inputs, outputs, {key: arrays[key] for key in entry["params"]}, exported)
+        params = {key: arrays[key] for key in entry["params"]}
+        found[name] = LoadedFunction(name, inputs, outputs, params, exported, jax.jit(exported.call))
     return found
 
 
