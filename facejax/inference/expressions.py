@@ -130,8 +130,7 @@ def displacements(
         if neutral is None or np.shape(neutral)[-2:] != shape:
             got = None if neutral is None else np.shape(neutral)
             raise ValueError(f"neutral: expected landmarks at rest (..., {shape[0]}, 3), got {got}")
-        centred = jnp.asarray(neutral) - jnp.mean(jnp.asarray(neutral), axis=-2, keepdims=True)
-        first = centred / jnp.sqrt(jnp.sum(centred**2, axis=(-2, -1), keepdims=True))
+        first = unit_landmarks(neutral)
     if not 0 <= stop < 1:
         raise ValueError(f"stop must lie in 0..1, got {stop}")
     curve = expression_lstm.generate(
@@ -140,6 +139,12 @@ def displacements(
     if not stop:
         return curve
     return curve[..., : int(jnp.max(expression_lstm.expression_length(curve, fraction=stop))), :, :]
+
+
+def unit_landmarks(neutral: np.ndarray | jax.Array) -> jax.Array:
+    """Return landmarks (..., L, 3) centred and divided by their norm, as networks that start from them read them."""
+    centred = jnp.asarray(neutral) - jnp.mean(jnp.asarray(neutral), axis=-2, keepdims=True)
+    return centred / jnp.sqrt(jnp.sum(centred**2, axis=(-2, -1), keepdims=True))
 
 
 def _structure(config: expression_lstm.Config, count: int) -> expression_lstm.ExpressionLSTM:

@@ -53,6 +53,7 @@ __all__ = [
     "meshes",
     "motion",
     "motion_from_noise",
+    "motion_on_timeline",
     "neutral_landmarks",
     "prepare",
     "sample_noise",
@@ -194,14 +195,43 @@ def _motion_from_noise(
     *,
     frames: tuple[int, ...],
 ) -> Array:
+    drawn = len(models.motion.chart.p) + 1
+    matrix = jnp.asarray(composition.timeline(frames, drawn=drawn), models.motion.chart.mean.dtype)
+    return motion_on_timeline(models, noise, labels, face.landmarks, face.size, matrix, intensity)
+
+
+@jax.jit
+def motion_on_timeline(
+    models: Models,
+    noise: Noise,
+    labels: Int[Array | np.ndarray, "*lead K"],
+    rest: Float[Array | np.ndarray, "L 3"],
+    size: Float[Array | np.ndarray, ""],
+    timeline: Float[Array | np.ndarray, "F PT"],
+    intensity: ArrayLike = 1.0,
+) -> Float[Array, "*lead F L 3"]:
+    """Return the landmark motion (..., F, L, 3) in mm of noise on a timeline: the formula of `motion_from_noise`.
+
+    Every argument is an array, so that no length is static. Nothing is checked but shapes.
+
+    Args:
+      noise: of `sample_noise`, with the leading axes of `labels`.
+      rest, size: `landmarks` (L, 3) and `size` () of a `PreparedFace`, in mm.
+      timeline: (F, P T) of `composition.timeline`, for P = K - 1 transitions of T generated frames.
+      intensity: one number, or one for each of the leading axes.
+
+    Raises:
+      ValueError: a timeline of another size.
+    """
+
     def one(noise: Noise, labels: Array) -> Array:
         pairs = jnp.stack([labels[:-1], labels[1:]], axis=-1)
         curves = composition.generate(models.motion, models.starts, noise, pairs).curves[None]
-        matrix = composition.timeline(frames, drawn=curves.shape[2])
-        return composition.join(curves, jnp.asarray(matrix, curves.dtype))[0]
+        return composition.join(curves, timeline)[0]
 
     unitless = _map_leading(one, np.shape(labels)[:-1], noise, jnp.asarray(labels))
-    return face.landmarks + intensity * face.size * unitless
+    scale = jnp.asarray(intensity)
+    return rest + (scale if scale.ndim == 0 else scale[..., None, None, None]) * size * unitless
 
 
 def _keys(key: Array, lead: tuple[int, ...]) -> Array:

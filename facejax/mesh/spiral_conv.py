@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import export
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -60,9 +61,10 @@ def spiral_conv(
         raise ValueError(
             f"stencil: has {expected} (positions, vertices), expected {(positions, count)} of kernel and x"
         )
-    if jax.default_backend() != "cpu" or positions * count * batch * out_channels <= _AT_ONCE:
+    # A symbolic batch (`jax.export`) counts as large.
+    if not export.is_symbolic_dim(batch) and positions * count * batch * out_channels <= _AT_ONCE:
         return spiral_conv_at_once(x, kernel, stencil)
-    return spiral_conv_by_position(x, kernel, stencil)
+    return jax.lax.platform_dependent(x, kernel, stencil, cpu=spiral_conv_by_position, default=spiral_conv_at_once)
 
 
 @jax.jit
@@ -76,7 +78,7 @@ def spiral_conv_by_position(
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
     rows = jnp.reshape(x, (count * batch, channels))
-    if out_channels < _FEW_CHANNELS <= batch:
+    if out_channels < _FEW_CHANNELS and (export.is_symbolic_dim(batch) or batch >= _FEW_CHANNELS):
         flat_kernel = kernel.transpose(0, 2, 1).reshape(positions * out_channels, channels)
         planes = jax.lax.dot_general(flat_kernel, rows, (((1,), (1,)), ((), ())))
         planes = planes.reshape(positions, out_channels, count, batch)
@@ -122,7 +124,8 @@ def _joined(stencil: Stencil) -> Stencil:
 
 def _by_vertex(table: AnyArray) -> AnyArray:
     """Reshape (S, J, M) to (J, M * S)."""
-    return table.transpose(1, 2, 0).reshape(table.shape[1], -1)
+    positions, slots, vertices = table.shape
+    return table.transpose(1, 2, 0).reshape(slots, vertices * positions)
 
 
 def _sum_positions(
@@ -156,9 +159,16 @@ def _apply(x: AnyArray, *tables: AnyArray, axis: int, transposed: bool) -> jax.A
 
 def _gather(x: AnyArray, index: AnyArray, weight: AnyArray, axis: int) -> jax.Array:
     """Return the sum over k of weight[k] x[index[k]]."""
-    if len(index) <= _FEW_LISTS or jax.default_backend() == "cpu":
+
+    def one_by_one(x: AnyArray, index: AnyArray, weight: AnyArray) -> jax.Array:
         return jnp.asarray(sum(_weigh(w, _take(x, i, axis), axis) for i, w in zip(index, weight, strict=True)))
-    return jnp.sum(_weigh(weight, _take(x, index, axis), axis), axis=axis)
+
+    def at_once(x: AnyArray, index: AnyArray, weight: AnyArray) -> jax.Array:
+        return jnp.sum(_weigh(weight, _take(x, index, axis), axis), axis=axis)
+
+    if len(index) <= _FEW_LISTS:
+        return one_by_one(x, index, weight)
+    return jax.lax.platform_dependent(x, index, weight, cpu=one_by_one, default=at_once)
 
 
 def _take(x: AnyArray, index: AnyArray, axis: int) -> jax.Array:

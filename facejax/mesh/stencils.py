@@ -85,3 +85,10 @@ def flat(spirals: Integer[np.ndarray, "V S"]) -> Stencil:
     """Return the maps of spirals (V, S) on a signal of the same V vertices, without upsampling."""
     own = np.arange(len(spirals))[:, None]
     return build(spirals, own, np.ones_like(own, np.float32), len(spirals))
+
+
+def without_transpose(stencil: Stencil) -> Stencil:
+    """Return a stencil without the tables of the transpose, half of its memory: for inference, not for gradients."""
+    back, weight = (table[:, :0] for table in (stencil.back, stencil.back_weight))
+    rest = (table[:, :0] for table in (stencil.rest_from, stencil.rest_to, stencil.rest_weight))
+    return Stencil(stencil.source, stencil.weight, back, weight, *rest)

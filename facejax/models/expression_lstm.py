@@ -170,16 +170,38 @@ def generate(
     known = 1 if prefix is None else prefix.shape[-3]
     if frames < 2 or known > frames or known < 1:
         raise ValueError(f"frames: expected 2 or more, and {known} for the prefix; got {frames}")
-    dtype = params.scale.neutral_mean.dtype
-    steps = jnp.zeros((*lead, frames - 1, *shape), dtype)
+    curve = jnp.zeros((*lead, frames, *shape), params.scale.neutral_mean.dtype)
     if prefix is not None:
         _check(params, prefix, "prefix")
-        # Entry t holds the step that led to frame t, as in a training block.
-        steps = steps.at[..., 1:known, :, :].set(jnp.diff(jnp.asarray(prefix, dtype), axis=-3)[..., : frames - 2, :, :])
+        curve = curve.at[..., :known, :, :].set(prefix)
+    return continue_curve(params, curve, known, neutral, stop=stop)
+
+
+@jax.jit
+def continue_curve(
+    params: ExpressionLSTM,
+    curve: Float[Array | np.ndarray, "... T L 3"],
+    known: int | Int[Array | np.ndarray, ""],
+    neutral: Float[Array | np.ndarray, "... L 3"] | None = None,
+    *,
+    stop: float | Real[Array, ""] = 0.0,
+) -> Float[Array, "... T L 3"]:
+    """Continue the first `known` frames (1 or more) of a curve to its length; its other frames are not read.
+
+    `generate` for arrays: neither the length nor `known` is static. `neutral` and `stop` as there.
+
+    Raises:
+      ValueError: wrong shapes.
+    """
+    _check(params, curve, "curve")
+    frames = curve.shape[-3]
+    time = jnp.arange(frames - 1)[:, None, None]
+    given = jnp.where(time < known - 1, jnp.diff(jnp.asarray(curve), axis=-3), 0)
+    # Entry t holds the step that led to frame t, as in a training block.
+    steps = jnp.concatenate([jnp.zeros_like(jnp.asarray(curve)[..., :1, :, :]), given], axis=-3)[..., :-1, :, :]
     made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
-    if prefix is not None:
-        made = made.at[..., : known - 1, :, :].set(jnp.diff(jnp.asarray(prefix, dtype), axis=-3))
-    curve = jnp.cumsum(jnp.concatenate([jnp.zeros((*lead, 1, *shape), dtype), made], axis=-3), axis=-3)
+    made = jnp.where(time < known - 1, given, made)
+    curve = jnp.cumsum(jnp.concatenate([jnp.zeros_like(jnp.asarray(curve)[..., :1, :, :]), made], axis=-3), axis=-3)
     last = jnp.where(stop > 0, expression_length(curve, fraction=stop), frames) - 1
     place = jnp.minimum(jnp.arange(frames), last[..., None])
     return jnp.take_along_axis(curve, place[..., None, None], axis=-3)

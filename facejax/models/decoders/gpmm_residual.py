@@ -11,6 +11,7 @@ N vertices, L landmarks, B samples, k components; millimetres.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from facejax.mesh import strain
 from facejax.mesh.hierarchy import Hierarchy
+from facejax.models import layers
 from facejax.models.decoders import gpmm, linear, residual
 
 BATCH = 16
@@ -83,9 +85,9 @@ def apply(
     base = linear.apply(face_map, marks)
     if not exact or not refined or base.size == 0:
         return base
-    lead = base.shape[:-2]
-    flat = base.reshape(math.prod(lead), *base.shape[-2:])
-    moved = refine(params, marks.reshape(len(flat), *marks.shape[-2:]), flat, face.neutral)
+    count = math.prod(base.shape[:-2])
+    flat = base.reshape(count, *base.shape[-2:])
+    moved = refine(params, marks.reshape(count, *marks.shape[-2:]), flat, face.neutral)
     return moved.reshape(base.shape)
 
 
@@ -105,25 +107,16 @@ def refine(
 
     Equal pieces of at most 16 samples are refined one after another, so that temporary arrays stay small.
     """
-    count = len(base)
-    pieces = max(-(-count // BATCH), 1)
-    size = -(-count // pieces)
-    rows = [displacements, base] + ([neutral] if np.ndim(neutral) == 3 else [])
+    rows = [jnp.asarray(x) for x in (displacements, base)] + ([jnp.asarray(neutral)] if np.ndim(neutral) == 3 else [])
 
-    def cut(x: Array | np.ndarray) -> Array:
-        padded = jnp.pad(x, ((0, pieces * size - count), (0, 0), (0, 0)), mode="edge")
-        return padded.reshape(pieces, size, *x.shape[1:])
+    def one(displacements: Array, base: Array, *rest: Array) -> Array:
+        face = rest[0] if rest else neutral
+        return residual.apply(params.network, params.hierarchy, params.tables, displacements, base, face)
 
-    def one(part: tuple[Array, ...]) -> Array:
-        rest = part[2] if len(part) == 3 else neutral
-        return residual.apply(params.network, params.hierarchy, params.tables, part[0], part[1], rest)
+    def run(rows: Sequence[Array]) -> Array:
+        return layers.map_pieces(one, rows, BATCH)
 
-    def run(parts: tuple[Array, ...]) -> Array:
-        out = jax.lax.map(one, parts)
-        return out.reshape(-1, *out.shape[2:])[:count]
-
-    parts = tuple(cut(x) for x in rows)
-    return jax.lax.cond(params.network.gate == 0, lambda _: jnp.asarray(base), run, parts)
+    return jax.lax.cond(params.network.gate == 0, lambda rows: rows[1], run, rows)
 
 
 def pack(params: GPMMResidual, *, components: int | None = None) -> dict[str, Any]:

@@ -109,7 +109,9 @@ def apply(
     stretch, normal = strain.strain(moved, rest, tables)
     position = (rest - scale.face[:, None]) / POSITION_MM
     embedding = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], EMBEDDING))
-    x = (jnp.asarray(displacements) - scale.landmark_mean).reshape(len(base), -1) / scale.landmark_std
+    x = (jnp.asarray(displacements) - scale.landmark_mean).reshape(
+        base.shape[0], scale.landmark_mean.size
+    ) / scale.landmark_std
     decoded = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
     x = jnp.concatenate([stretch / STRAIN, moved / DISPLACEMENT_MM, normal, position, embedding, decoded], axis=-1)
     first, second = weights["mix"]
@@ -125,7 +127,7 @@ def _check(
     marks, vertices = scale.landmark_mean.shape, scale.face.shape
     if displacements.ndim != 3 or displacements.shape[1:] != marks:
         raise ValueError(f"displacements: expected (B, {marks[0]}, 3), got {displacements.shape}")
-    if base.shape != (len(displacements), *vertices) or neutral.shape not in (vertices, base.shape):
+    if base.shape != (displacements.shape[0], *vertices) or neutral.shape not in (vertices, base.shape):
         raise ValueError(
             f"expected a base of (B, {vertices[0]}, 3) and neutral faces of that shape or ({vertices[0]}, 3), got "
             f"{base.shape} and {neutral.shape}"

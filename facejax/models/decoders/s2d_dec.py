@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Float
 
 from facejax.mesh.hierarchy import Hierarchy
@@ -23,6 +24,7 @@ from facejax.models import layers
 from facejax.models.layers import Weights
 
 CHANNELS = (128, 64, 32, 32, 16)
+CHUNK = 1024  # samples to decode at once, on other platforms than a CPU
 
 
 class Scale(NamedTuple):
@@ -99,7 +101,7 @@ def decode_levels(weights: Weights, hierarchy: Hierarchy, x: Float[Array, "B inp
     convs = weights["convs"][: len(upsamplings)]
     # The batch axis comes second, as `spiral_conv` expects.
     x = layers.dense(weights["dense"], x)
-    x = x.reshape(len(x), hierarchy.sizes[-1], convs[0]["kernel"].shape[1]).transpose(1, 0, 2)
+    x = x.reshape(x.shape[0], hierarchy.sizes[-1], convs[0]["kernel"].shape[1]).transpose(1, 0, 2)
     for conv, stencil in zip(convs, upsamplings, strict=True):
         x = jax.nn.elu(layers.spiral_conv(conv, x, stencil))
     return x
@@ -116,7 +118,7 @@ def apply(
     """Return vertex displacements in mm from landmark displacements in mm.
 
     Pass whole batches: a batch is much faster than a vmap over single samples. `chunk` samples are decoded at a time,
-    by default a number that suits the backend. Move the hierarchy to the device once (`jax.device_put`).
+    by default a number that suits the platform. Move the hierarchy to the device once (`jax.device_put`).
 
     Raises:
       ValueError: wrong number of landmarks.
@@ -126,7 +128,17 @@ def apply(
         raise ValueError(f"displacements: expected (..., {expected[0]}, 3), got {displacements.shape}")
     lead = displacements.shape[:-2]
     flat = jnp.asarray(displacements).reshape(-1, 3 * expected[0])
-    out = _in_chunks(partial(_decode, params, hierarchy), flat, chunk or _chunk(hierarchy))
+
+    def in_chunks(chunk: int) -> Callable[[Array], Array]:
+        return lambda flat: layers.map_pieces(partial(_decode, params, hierarchy), [flat], chunk)
+
+    few = _cpu_chunk(hierarchy)
+    if chunk is not None:
+        out = in_chunks(chunk)(flat)
+    elif not export.is_symbolic_dim(flat.shape[0]) and flat.shape[0] <= few:
+        out = _decode(params, hierarchy, flat)
+    else:
+        out = jax.lax.platform_dependent(flat, cpu=in_chunks(few), default=in_chunks(CHUNK))
     return out.reshape(*lead, *out.shape[1:])
 
 
@@ -165,22 +177,11 @@ def _decode(params: S2DDec, hierarchy: Hierarchy, displacements: Array) -> Array
     return scale.vertex_mean + scale.vertex_std * x.transpose(1, 0, 2)
 
 
-def _chunk(hierarchy: Hierarchy) -> int:
-    """Return the number of samples to decode at once.
+def _cpu_chunk(hierarchy: Hierarchy) -> int:
+    """Return the number of samples to decode at once on a CPU.
 
-    On a CPU, the signals that are gathered from should stay in the cache, and glibc's allocator returns temporary
-    arrays of more than 32 MB to the system after every call. Chunks of 16 samples were the fastest at 5,000 vertices:
-    64 samples took 34 ms, against 42 ms in chunks of 32 or of 4.
+    The signals that are gathered from should stay in the cache, and glibc's allocator returns temporary arrays of more
+    than 32 MB to the system after every call. Chunks of 16 samples were the fastest at 5,000 vertices: 64 samples took
+    34 ms, against 42 ms in chunks of 32 or of 4.
     """
-    return max(1, 82_000 // hierarchy.sizes[0]) if jax.default_backend() == "cpu" else 1024
-
-
-def _in_chunks(function: Callable[[Array], Array], x: Array, chunk: int) -> Array:
-    """Apply a function to equal pieces of at most `chunk` rows, one after another."""
-    pieces = -(-len(x) // chunk)
-    if pieces <= 1:
-        return function(x)
-    size = -(-len(x) // pieces)
-    padded = jnp.pad(x, ((0, pieces * size - len(x)), (0, 0)))
-    out = jax.lax.map(function, padded.reshape(pieces, size, -1))
-    return out.reshape(-1, *out.shape[2:])[: len(x)]
+    return max(1, 82_000 // hierarchy.sizes[0])
