@@ -26,6 +26,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Float64, Int32, Integer, Real
 
 from facejax.geometry import align, sphere, srvf
+from facejax.geometry.precision import HIGHEST
 from facejax.geometry.sphere import AnyArray
 
 TIME_WARPS = ("even", "performed")
@@ -110,7 +111,10 @@ def transition(
     pp, pw, ww = (jnp.sum(x * y, axis=-1)[..., None, :] for x, y in ((flat[0],) * 2, flat, (flat[1],) * 2))
     # Rounding may leave the square of a step that cancels just below 0; the root takes it as 0.
     pace = sphere.safe_sqrt(a**2 * pp + 2 * a * b * pw + b**2 * ww)
-    moves = sum(jnp.einsum("...ft,...td->...fd", part * pace, x) for part, x in zip((a, b), flat, strict=True))
+    moves = sum(
+        jnp.einsum("...ft,...td->...fd", part * pace, x, precision=HIGHEST)
+        for part, x in zip((a, b), flat, strict=True)
+    )
     moves = jnp.asarray(moves)
     moves = moves.reshape(*moves.shape[:-1], *q1.shape[-2:])
     log_length = _between(tau, jnp.asarray(log_length1)[..., None], jnp.asarray(log_length2)[..., None])

@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from facejax.geometry.precision import HIGHEST
 from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 
@@ -76,14 +77,14 @@ def procrustes(
     _check_points(target, "target", source.shape[-2])
     (from_, source_centroid), (to, target_centroid) = centre(source), centre(target)
     (from_, small), (to, large) = _unit(from_), _unit(to)
-    covariance = jnp.einsum("...ki,...kj->...ij", to, from_)
+    covariance = jnp.einsum("...ki,...kj->...ij", to, from_, precision=HIGHEST)
     rotation = _rotation(covariance)
     spread = jnp.sum(from_**2, axis=(-2, -1)) + jnp.zeros(covariance.shape[:-2], covariance.dtype)
     overlap = jnp.sum(rotation * covariance, axis=(-2, -1))
     usable = spread > 0
     grown = overlap / jnp.where(usable, spread, 1) * (large / small)
     scale = jnp.where(usable, grown, 1) if scaling else jnp.ones_like(spread)
-    turned = jnp.einsum("...ij,...j->...i", rotation, source_centroid)
+    turned = jnp.einsum("...ij,...j->...i", rotation, source_centroid, precision=HIGHEST)
     return Similarity(rotation, scale, target_centroid - scale[..., None] * turned)
 
 
@@ -91,7 +92,7 @@ def procrustes(
 def apply(similarity: Similarity, points: Float[AnyArray, "... K 3"]) -> Float[Array, "... K 3"]:
     """Apply a similarity to points (..., K, 3)."""
     _check_points(points, "points")
-    turned = jnp.einsum("...ij,...kj->...ki", similarity.rotation, points)
+    turned = jnp.einsum("...ij,...kj->...ki", similarity.rotation, points, precision=HIGHEST)
     return similarity.scale[..., None, None] * turned + similarity.translation[..., None, :]
 
 
@@ -166,7 +167,7 @@ def _rotation(matrix: jax.Array) -> jax.Array:
     u, _, vt = jnp.linalg.svd(matrix)
     handed = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
     flip = jnp.stack([jnp.ones_like(handed), jnp.ones_like(handed), handed], axis=-1)
-    return (u * flip[..., None, :]) @ vt
+    return jnp.matmul(u * flip[..., None, :], vt, precision=HIGHEST)
 
 
 @_rotation.defjvp
@@ -176,13 +177,13 @@ def _rotation_jvp(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tupl
     # singular values and is NaN where two of them are equal; this divides by their sums.
     (matrix,), (change,) = primals, tangents
     rotation = _rotation(matrix)
-    stretch = jnp.einsum("...ki,...kj->...ij", rotation, matrix)
+    stretch = jnp.einsum("...ki,...kj->...ij", rotation, matrix, precision=HIGHEST)
     stretch = (stretch + jnp.swapaxes(stretch, -1, -2)) / 2
     trace = jnp.trace(stretch, axis1=-2, axis2=-1)[..., None, None]
     eye = jnp.eye(3, dtype=matrix.dtype)
     system = trace * eye - stretch
     unique = jnp.linalg.det(system)[..., None, None] > jnp.finfo(matrix.dtype).eps * trace**3
-    turned = jnp.einsum("...ki,...kj->...ij", rotation, change)
+    turned = jnp.einsum("...ki,...kj->...ij", rotation, change, precision=HIGHEST)
     skew = turned - jnp.swapaxes(turned, -1, -2)
     vector = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)[..., None]
     x, y, z = jnp.moveaxis(jnp.linalg.solve(jnp.where(unique, system, eye), vector)[..., 0], -1, 0)

@@ -39,6 +39,7 @@ from scipy.linalg import lapack
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
+from facejax.geometry.precision import HIGHEST
 from facejax.geometry.sphere import AnyArray
 
 COINCIDENT = 1e-6  # of the landmarks' extent: nearer landmarks coincide, flatter sets are coplanar
@@ -140,7 +141,7 @@ def warp(
             raise ValueError(f"{name}: expected a floating dtype, got {jnp.result_type(array)}")
     # By default GPUs multiply float32 with ten bits of mantissa. One product for each axis: a batched product of (N, L)
     # by (L, 3) is so narrow that a CPU takes two to four times as long.
-    precision = jax.lax.Precision.HIGHEST
+    precision = HIGHEST
     axes = [jnp.einsum("...nl,...l->...n", weights, displacements[..., c], precision=precision) for c in range(3)]
     return jnp.stack(axes, axis=-1)
 
@@ -200,7 +201,7 @@ def _spread_on(kernel: str, dtype: type, fit: tuple[Any, ...], vertices: jax.Arr
     # Not |v|^2 - 2 v.c + |c|^2 by a product, which cancels at the landmarks.
     squared = sum(jnp.square(points[:, None, axis] - centres[:, axis]) for axis in range(3))
     count = len(centres)
-    found = KERNELS[kernel].phi(jnp, squared) @ inverse[:count]
+    found = jnp.matmul(KERNELS[kernel].phi(jnp, squared), inverse[:count], precision=HIGHEST)
     if len(inverse) > count:
         # Not by a wider product: appending columns to the basis is one more pass over memory, this sum is fused.
         found += inverse[count] + sum(points[:, None, axis] * inverse[count + 1 + axis] for axis in range(3))

@@ -23,6 +23,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from facejax.geometry.precision import HIGHEST
 from facejax.geometry.sphere import AnyArray, safe_sqrt
 
 FLOOR = 1e-12
@@ -139,7 +140,7 @@ def _running(pace: jax.Array, q: jax.Array) -> jax.Array:
     count = q.shape[-2]
     if count <= BLOCK:
         earlier = jnp.tril(jnp.ones((count + 1, count), q.dtype), -1)
-        return jnp.einsum("...ft,...td->...fd", earlier * pace[..., None, :], q, precision=lax.Precision.HIGHEST)
+        return jnp.einsum("...ft,...td->...fd", earlier * pace[..., None, :], q, precision=HIGHEST)
     blocks = -(-count // BLOCK)
     spare = [(0, 0)] * (q.ndim - 2) + [(0, blocks * BLOCK - count)]
     q = jnp.pad(q, [*spare, (0, 0)]).reshape(*q.shape[:-2], blocks, BLOCK, q.shape[-1])

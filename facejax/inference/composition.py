@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from facejax.geometry import srvf
+from facejax.geometry.precision import HIGHEST
 from facejax.models.motion import generators, start_poses, tangent_pca
 
 REACH = 8  # frames on each side of a joint over which its correction decays
@@ -152,7 +153,7 @@ def join(curves: jax.Array, matrix: jax.Array) -> jax.Array:
     samples, count, frames, *rest = curves.shape
     if matrix.shape[1] != count * frames:
         raise ValueError(f"matrix: expected (F, {count * frames}) for {count} x {frames} frames, got {matrix.shape}")
-    return jnp.einsum("ft,stlc->sflc", matrix, curves.reshape(samples, count * frames, *rest))
+    return jnp.einsum("ft,stlc->sflc", matrix, curves.reshape(samples, count * frames, *rest), precision=HIGHEST)
 
 
 def timeline(frames: Sequence[int], *, drawn: int = 30, reach: int = REACH) -> np.ndarray:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from facejax.geometry import align, rbf
+from facejax.geometry.precision import HIGHEST
 from facejax.inference import checks, pipeline
 from facejax.io.meshes import MeshError
 from facejax.landmarks import canonical_frame, schemes
@@ -112,7 +113,7 @@ def animate(face: Face, curve: np.ndarray | jax.Array, *, intensity: float = 1.0
     own = np.isin(face.shared[1], schemes.by_count(len(face.landmarks)).stable)
     pose = align.procrustes(jnp.broadcast_to(rest, marks.shape)[..., own, :], marks[..., own, :])
     # To the head's own frame, where the neck is fixed; the rigid motion is applied to all vertices afterwards.
-    undone = jnp.einsum("...ji,...lj->...li", pose.rotation, marks - pose.translation[..., None, :])
+    undone = jnp.einsum("...ji,...lj->...li", pose.rotation, marks - pose.translation[..., None, :], precision=HIGHEST)
     moved = _move(face.vertices, face.weights, undone - rest)
     return align.apply(pose, moved)
 

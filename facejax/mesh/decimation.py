@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32, Integer, Real
 
+from facejax.geometry.precision import HIGHEST
 from facejax.geometry.sphere import AnyArray
 from facejax.mesh import closest_point, graph
 
@@ -92,4 +93,6 @@ def upsample(
 
     `corners` and `weights` are those of `upsampling`, or of a level of `facejax.mesh.hierarchy`.
     """
-    return jnp.einsum("nk,...nkc->...nc", jnp.asarray(weights), jnp.asarray(values)[..., jnp.asarray(corners), :])
+    return jnp.einsum(
+        "nk,...nkc->...nc", jnp.asarray(weights), jnp.asarray(values)[..., jnp.asarray(corners), :], precision=HIGHEST
+    )

@@ -25,7 +25,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-HIGHEST = jax.lax.Precision.HIGHEST
+from facejax.geometry.precision import HIGHEST
+
 Values = TypeVar("Values", np.ndarray, jax.Array)
 ANCHOR = 1e-4  # weight of a vertex that never moves
 MOTION = 0.05  # mm, root mean square: vertices that move more than this are anchored less

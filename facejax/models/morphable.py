@@ -29,10 +29,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from facejax.geometry.precision import HIGHEST
 from facejax.models import pca
 
 ROUNDING = 1e-6  # of a share of variance, from parameters in float32
-PRECISION = jax.lax.Precision.HIGHEST  # by default GPUs multiply float32 with ten bits of mantissa
 
 
 class MorphableModel(NamedTuple):
@@ -88,7 +88,7 @@ def project(params: MorphableModel, values: Float[Array | np.ndarray, "*lead N C
     if jnp.shape(values)[-2:] != params.mean.shape:
         n, c = params.mean.shape
         raise ValueError(f"values: expected (..., {n}, {c}), got {jnp.shape(values)}")
-    along = jnp.einsum("...nc,knc->...k", values - params.mean, params.components, precision=PRECISION)
+    along = jnp.einsum("...nc,knc->...k", values - params.mean, params.components, precision=HIGHEST)
     return along / params.deviation
 
 
@@ -217,7 +217,7 @@ def _apply(params: MorphableModel, name: str, coefficients: Array | np.ndarray) 
     if jnp.shape(coefficients)[-1:] != params.deviation.shape:
         raise ValueError(f"{name}: expected (..., {len(params.deviation)}), got {jnp.shape(coefficients)}")
     along = coefficients * params.deviation
-    return params.mean + jnp.einsum("...k,knc->...nc", along, params.components, precision=PRECISION)
+    return params.mean + jnp.einsum("...k,knc->...nc", along, params.components, precision=HIGHEST)
 
 
 def _examples(name: str, values: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ def vectorize_models(step: Step, names: Sequence[str], ids: Sequence[int] | np.n
 
     def several(common: Tree, stacked: Tree) -> tuple[Tree, Metrics]:
         each = partial(one, common)
-        return jax.lax.map(each, stacked) if jax.default_backend() == "cpu" else jax.vmap(each)(stacked)
+        return jax.lax.platform_dependent(stacked, cpu=partial(jax.lax.map, each), default=jax.vmap(each))
 
     def stepped(state: TrainState, batch: Tree, constants: Tree) -> tuple[TrainState, Metrics]:
         own, shared = constants

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec as P
 
-from facejax.inference import pipeline
+from facejax.inference import composition, pipeline
 from tests import tiny_models
 
 ROOT = Path(__file__).parents[2]
@@ -231,3 +231,32 @@ def test_motion_is_a_function_of_its_noise(models, neutrals):
     assert np.abs(slope.transitions).max() > 0 and np.isfinite(slope.transitions).all()
     with pytest.raises(ValueError, match="noise: expected arrays of shapes"):
         pipeline.motion_from_noise(models, noise, labels[0], face)
+
+
+def products(jaxpr):
+    """The precision of every matrix product of a function, those of inner functions included."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.params["precision"]
+        for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
+            if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                yield from products(getattr(inner, "jaxpr", inner))
+
+
+def test_products_of_positions_ask_for_all_bits():
+    """A GPU's default would round them; a CPU's does not, so that only the program can tell."""
+    models = tiny_models.make()
+    neutral, marks = models.face.vertices, jnp.zeros((3, 4, 3))
+
+    def linear(models, neutral, noise):
+        return pipeline.vertices(models, pipeline.prepare(models, neutral), marks, refined=False, noise=noise)
+
+    exact = (jax.lax.Precision.HIGHEST,) * 2
+    found = list(products(jax.make_jaxpr(linear)(models, neutral, 0.5).jaxpr))
+    assert len(found) >= 6 and set(found) == {exact}
+    joined = list(products(jax.make_jaxpr(composition.join)(jnp.zeros((1, 1, 4, 5, 3)), jnp.zeros((6, 4))).jaxpr))
+    assert joined == [exact]
+    # The check sees products of other precision: those of the generator's layers.
+    face = pipeline.prepare(models, neutral)
+    drawn = products(jax.make_jaxpr(lambda models, key: pipeline.motion(models, key, LABELS, face))(models, KEY).jaxpr)
+    assert set(drawn) == {exact, None}

@@ -35,11 +35,11 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from facejax.geometry.precision import HIGHEST
 from facejax.mesh import deformation_transfer
 from facejax.models.decoders import linear
 from facejax.models.records import Leaf, Number
 
-HIGHEST = jax.lax.Precision.HIGHEST
 SMOOTH_SCALES_MM = (10.0, 20.0, 40.0, 80.0)  # of the smooth prior: wrinkles, cheek, jaw, head
 NOISE_GRID_MM = np.append(0.0, np.geomspace(0.003, 5.0, 120))  # steps of 6 %
 

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from facejax.geometry.precision import HIGHEST
 from facejax.models import pca as principal
 
 Batches = Iterable[tuple[np.ndarray, np.ndarray]]
@@ -75,7 +76,7 @@ def apply(params: LinearMap, landmarks: Float[Array | np.ndarray, "... L 3"]) ->
     # The last size is explicit (not -1), so that zero frames work.
     x = (landmarks - params.landmark_mean).reshape(*landmarks.shape[:-2], 3 * expected[0])
     for factor in params.factors:
-        x = x @ factor
+        x = jnp.matmul(x, factor, precision=HIGHEST)
     return params.vertex_mean + x.reshape(*x.shape[:-1], *params.vertex_mean.shape)
 
 

@@ -28,6 +28,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from facejax.geometry import sphere
+from facejax.geometry.precision import HIGHEST
 from facejax.models import layers
 from facejax.models.layers import Weights
 from facejax.models.motion import tangent_pca
@@ -153,7 +154,7 @@ def from_state(chart: TangentPCA, state: State, start: ArrayLike, end: ArrayLike
     y, s = state
     y = (y / sphere.norm(y)[..., None, None, None])[0, 0]
     # p is normalised, and the basis tangent to it, only up to rounding: normalise again.
-    q = y[0] * chart.p + jnp.sqrt(len(chart.p)) * jnp.tensordot(y[1:], chart.basis, 1)
+    q = y[0] * chart.p + jnp.sqrt(len(chart.p)) * jnp.tensordot(y[1:], chart.basis, 1, precision=HIGHEST)
     q = q / sphere.norm(q)[..., None, None, None]
     log_length, log_seconds = chart.scalar_mean[start, end] + chart.scalar_std * s
     return Motion(q, log_length, log_seconds)

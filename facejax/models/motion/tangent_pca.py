@@ -24,6 +24,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from facejax.geometry import sphere
+from facejax.geometry.precision import HIGHEST
 from facejax.models import pca
 
 MIN_PAIR_MOTIONS = 8  # below this, a pair's own standard deviations are replaced by the pooled ones
@@ -129,7 +130,7 @@ def encode(
 ) -> Float[Array, " coordinates"]:
     """Return the coordinates (2 + R,) of a tangent vector at p projected onto the basis, and of two scalars ()."""
     scalars = (jnp.stack([log_length, log_seconds]) - chart.scalar_mean[start, end]) / chart.scalar_std
-    return jnp.concatenate([scalars, jnp.tensordot(chart.basis, tangent, 3)])
+    return jnp.concatenate([scalars, jnp.tensordot(chart.basis, tangent, 3, precision=HIGHEST)])
 
 
 @jax.jit
@@ -137,7 +138,7 @@ def decode(
     chart: TangentPCA, values: Float[Array | np.ndarray, " coordinates"], start: ArrayLike, end: ArrayLike
 ) -> tuple[Float[Array, "steps L 3"], Float[Array, ""], Float[Array, ""]]:
     """Return the tangent vector at p, made exactly tangent, log-length and log-seconds of coordinates (2 + R,)."""
-    tangent = sphere.project(chart.p, jnp.tensordot(values[SCALARS:], chart.basis, 1))
+    tangent = sphere.project(chart.p, jnp.tensordot(values[SCALARS:], chart.basis, 1, precision=HIGHEST))
     log_length, log_seconds = chart.scalar_mean[start, end] + chart.scalar_std * values[:SCALARS]
     return tangent, log_length, log_seconds
 
@@ -147,14 +148,15 @@ def encode_pose(
     chart: TangentPCA, displacement: Float[Array | np.ndarray, "L 3"], start: ArrayLike
 ) -> Float[Array, " D"]:
     """Return the pose of a first frame, given as displacement from neutral; zero if its label `start` is neutral."""
-    pose = jnp.tensordot(chart.pose_basis, displacement - chart.pose_mean[start], 2) / chart.pose_scale
+    offset = displacement - chart.pose_mean[start]
+    pose = jnp.tensordot(chart.pose_basis, offset, 2, precision=HIGHEST) / chart.pose_scale
     return jnp.where(jnp.asarray(start) == 0, 0.0, pose)
 
 
 @jax.jit
 def decode_pose(chart: TangentPCA, pose: Float[Array | np.ndarray, " D"], start: ArrayLike) -> Float[Array, "L 3"]:
     """Return the displacement from neutral of a pose."""
-    return chart.pose_mean[start] + jnp.tensordot(pose * chart.pose_scale, chart.pose_basis, 1)
+    return chart.pose_mean[start] + jnp.tensordot(pose * chart.pose_scale, chart.pose_basis, 1, precision=HIGHEST)
 
 
 @jax.jit
