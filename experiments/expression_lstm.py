@@ -34,6 +34,8 @@ from facejax.data.synthetic import expression_recipes, makehuman4d
 from facejax.evaluation import expression_error
 from facejax.inference import expressions
 from facejax.models import expression_lstm
+from facejax.models.labels import Labels
+from facejax.models.records import Provenance
 from facejax.training import metric_logger
 from facejax.training.recipes import fit_expression_lstm
 from facejax.training.recipes.fit_expression_lstm import PAPER, ExpressionPlan
@@ -120,7 +122,8 @@ def run(config: Config) -> dict[str, Any]:
     alone = scores(config, variant, nets[name], ("test",))
     metrics = {"chosen": name, "choice": table, "test": judged, "test_alone": alone, "train_seconds": seconds}
     made = _run.record(config, seconds=time.perf_counter() - begun, dataset=_dataset(config, variant).index["spec"])
-    networks = networks._replace(about={"made": made, "variant": name, "plan": variant.plan._asdict(), "test": judged})
+    about = {"made": made, "variant": name, "plan": variant.plan._asdict(), "test": judged}
+    networks = networks.replace(about=Provenance(about))
     for path in [config.out / expressions.RELEASED] + [PACKAGED] * config.release:
         expressions.save(path, networks)
     figure = _lstm_report.plot(config.out / "expression_lstm.png", judged)
@@ -229,7 +232,9 @@ def _networks(config: Config, variant: Variant, params: expression_lstm.Expressi
         recordings(config, variant, "train").curves.shape[1] + sequences.TAIL_FRAMES,
         _dataset(config, variant),
     )
-    return expressions.Expressions(trained_labels(data), params, variant.config, float(data.index["rate"]), frames, {})
+    return expressions.Expressions(
+        Labels(trained_labels(data)), params, variant.config, float(data.index["rate"]), frames
+    )
 
 
 if __name__ == "__main__":

@@ -12,30 +12,33 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jax.typing import DTypeLike
 
 from facejax.inference import checks
 from facejax.io import weights
 from facejax.models import expression_lstm, model_file
+from facejax.models.labels import Labels
+from facejax.models.records import Provenance
 
 RELEASED = "expressions.safetensors"
 STOP = 0.01  # an expression has ended when its energy falls below this fraction of the maximum
 
 
-class Expressions(NamedTuple):
-    """One network per expression."""
+class Expressions(struct.PyTreeNode):
+    """One network per expression: a pytree of arrays, an argument of compiled functions."""
 
-    labels: tuple[str, ...]
+    labels: Labels = struct.field(pytree_node=False)
     params: expression_lstm.ExpressionLSTM  # stacked, (E, ...)
-    config: expression_lstm.Config
-    rate: float  # frames per second
-    frames: int  # of the longest training sequence, its tail included
-    about: dict[str, Any]  # provenance
+    config: expression_lstm.Config = struct.field(pytree_node=False)
+    rate: float = struct.field(pytree_node=False)  # frames per second
+    frames: int = struct.field(pytree_node=False)  # of the longest training sequence, its tail included
+    about: Provenance = struct.field(pytree_node=False, default=Provenance())
 
 
 def load(path: str | os.PathLike[str] | None = None) -> Expressions:
@@ -46,7 +49,7 @@ def load(path: str | os.PathLike[str] | None = None) -> Expressions:
     like = _structure(config, len(labels))
     tree, about = weights.load(file, like)
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
-    return Expressions(labels, params, config, rate, frames, about.get("about", {}))
+    return Expressions(Labels(labels), params, config, rate, frames, Provenance(about.get("about", {})))
 
 
 def _check_metadata(file: Any, about: dict[str, Any]) -> tuple[tuple[str, ...], expression_lstm.Config, float, int]:
@@ -89,7 +92,7 @@ def save(path: str | os.PathLike[str], networks: Expressions) -> None:
         "config": networks.config._asdict(),
         "rate": networks.rate,
         "frames": networks.frames,
-        "about": networks.about,
+        "about": dict(networks.about),
     }
     weights.save(path, networks.params._replace(weights=halved), metadata=described)
 

@@ -9,7 +9,6 @@ N vertices, F triangles, L landmarks; millimetres.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
 from importlib import resources
 from typing import Any
 
@@ -24,41 +23,10 @@ from facejax.models import model_file
 from facejax.models.decoders import gpmm_residual, s2d_dec
 from facejax.models.labels import Labels
 from facejax.models.motion import generators, start_poses, tangent_pca
-from facejax.models.records import HostLeaf
+from facejax.models.records import HostLeaf, Provenance
 
 RELEASED = "makehuman4d.safetensors"
 COMPONENTS = 200  # of the GPMM in a file; twice as many gain 0.001 mm and add 4 MB
-
-
-class Provenance(Mapping[str, Any]):
-    """Provenance of weights: command, commit, dataset, errors.
-
-    All provenances are equal, so that models that differ in nothing else share their compiled functions.
-    """
-
-    def __init__(self, fields: Mapping[str, Any] = {}):
-        self._fields = dict(fields)
-
-    def __getitem__(self, name: str) -> Any:
-        return self._fields[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._fields)
-
-    def __len__(self) -> int:
-        return len(self._fields)
-
-    def __or__(self, other: Mapping[str, Any]) -> Provenance:
-        return Provenance({**self, **other})
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Provenance)
-
-    def __hash__(self) -> int:
-        return hash(Provenance)
-
-    def __repr__(self) -> str:
-        return f"Provenance({self._fields})"
 
 
 class Face(struct.PyTreeNode):

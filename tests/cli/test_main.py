@@ -17,6 +17,7 @@ from facejax.data.synthetic import makehuman
 from facejax.inference import expressions
 from facejax.io import livelink
 from facejax.models import expression_lstm
+from facejax.models.labels import Labels
 
 
 def run(capsys, *arguments):
@@ -225,7 +226,7 @@ def networks(tmp_path):
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *one)
     stacked.weights["dense"]["bias"] += 1.0  # from zero, a new network does not move
     path = tmp_path / "networks.safetensors"
-    expressions.save(path, expressions.Expressions(("anger", "fear"), stacked, config, 25.0, 12, {}))
+    expressions.save(path, expressions.Expressions(Labels(("anger", "fear")), stacked, config, 25.0, 12))
     return path
 
 

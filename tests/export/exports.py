@@ -7,6 +7,7 @@ import numpy as np
 from facejax.export import functions
 from facejax.inference import composition, expressions, pipeline
 from facejax.models import expression_lstm
+from facejax.models.labels import Labels
 
 FRAMES = (9, 6)
 
@@ -32,4 +33,4 @@ def networks(*, start="neutral"):
     scale = expression_lstm.Scale(0.1 * one, neutral, one, 0.5 * one, None)
     both = [expression_lstm.init(key, scale, config=config) for key in jax.random.split(jax.random.key(0))]
     params = jax.tree.map(lambda *leaves: jnp.stack(leaves), *both)
-    return expressions.Expressions(("joy", "anger"), params, config, 30.0, 20, {})
+    return expressions.Expressions(Labels(("joy", "anger")), params, config, 30.0, 20)

@@ -7,6 +7,8 @@ import pytest
 from facejax.inference import expressions
 from facejax.io import weights
 from facejax.models import expression_lstm
+from facejax.models.labels import Labels
+from facejax.models.records import Provenance
 
 L = 6
 
@@ -18,7 +20,7 @@ def made(start="zero", components=None, labels=("anger", "fear")):
     scale = expression_lstm.measure(steps, np.ones((4, 10), bool), neutral, config=config)
     one = [expression_lstm.init(jax.random.key(i), scale, config=config) for i in range(len(labels))]
     params = jax.tree.map(lambda *leaves: 3 * np.stack(leaves), *one)
-    return expressions.Expressions(labels, params, config, 25.0, 40, {"seed": 3})
+    return expressions.Expressions(Labels(labels), params, config, 25.0, 40, Provenance({"seed": 3}))
 
 
 @pytest.mark.parametrize("options", [{}, {"components": 5}, {"start": "neutral"}, {"labels": ("anger",)}])
@@ -26,7 +28,7 @@ def test_a_file_gives_the_same_motion(tmp_path, options):
     networks = made(**options)
     expressions.save(tmp_path / "n.safetensors", networks)
     found = expressions.load(tmp_path / "n.safetensors")
-    assert found.labels == networks.labels and found.config == networks.config and found.about == {"seed": 3}
+    assert found.labels == networks.labels and found.config == networks.config and dict(found.about) == {"seed": 3}
     assert (found.rate, found.frames) == (25.0, 40)
     neutral = np.random.default_rng(1).normal(size=(L, 3))
     for label in networks.labels:
@@ -42,7 +44,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     with pytest.raises(weights.WeightsError, match="no such weights file"):
         expressions.load(tmp_path / "none.safetensors")
     networks = made()
-    expressions.save(tmp_path / "n.safetensors", networks._replace(config=networks.config._replace(hidden=9)))
+    expressions.save(tmp_path / "n.safetensors", networks.replace(config=networks.config._replace(hidden=9)))
     with pytest.raises(weights.WeightsError, match="does not match the model"):
         expressions.load(tmp_path / "n.safetensors")
 
