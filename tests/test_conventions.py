@@ -153,6 +153,7 @@ BELOW = {
 BELOW["training"] = set(BELOW)
 BELOW["inference"] = set(BELOW)
 BELOW["evaluation"] = set(BELOW)
+BELOW["export"] = set(BELOW)
 BELOW["cli"] = set(BELOW)
 
 
@@ -296,11 +297,11 @@ def test_the_check_finds_what_points_the_wrong_way(tmp_path, file, line, wrong):
 
 
 def test_folders_hold_no_more_than_a_reader_can_survey():
-    """At most six modules and twelve folders at the package's root, at most 15 modules in a folder."""
+    """At most six modules and thirteen folders at the package's root, at most 15 modules in a folder."""
     package = ROOT / "facejax"
     folders = [path for path in package.rglob("*") if path.is_dir() and path.name != "__pycache__"]
     assert len(list(package.glob("*.py"))) <= 6
-    assert sum(path.parent == package for path in folders) <= 12
+    assert sum(path.parent == package for path in folders) <= 13
     assert [path for path in folders if len(list(path.glob("[!_]*.py"))) > 15] == []
 
 

@@ -233,6 +233,20 @@ class Fit:
 
 
 @dataclasses.dataclass(frozen=True)
+class Export:
+    """Write functions of the models as files that other programs run without facejax."""
+
+    format: Positional[Literal["stablehlo", "onnx", "web"]]
+    """stablehlo: programs that JAX compiles for any platform; onnx: ONNX models; web: a page that runs in a browser."""
+    out: Path
+    """Output folder; an export that it holds is replaced."""
+    model: Path | None = None
+    """Model file; default: the released models."""
+    functions: tuple[str, ...] = ()
+    """Names of functions, such as `decoder`; default: all of the format."""
+
+
+@dataclasses.dataclass(frozen=True)
 class View:
     """Show an animation or a mesh in a browser: write one HTML page and open it."""
 
@@ -254,5 +268,6 @@ Command = (
     | Annotated[Labels, subcommand("labels", prefix_name=False)]
     | Annotated[Data, subcommand("data", prefix_name=False)]
     | Annotated[Fit, subcommand("fit", prefix_name=False)]
+    | Annotated[Export, subcommand("export", prefix_name=False)]
     | Annotated[View, subcommand("view", prefix_name=False)]
 )

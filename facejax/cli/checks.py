@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from facejax.cli import labels
-from facejax.cli.arguments import Animate, Data, Demo, Fit, Generate, Labels, MakeHuman, Prepare, Register, View
+from facejax.cli.arguments import Animate, Data, Demo, Export, Fit, Generate, Labels, MakeHuman, Prepare, Register, View
 from facejax.inference import checks
 from facejax.models import labels as label_names
 
 MAX_PEOPLE = 1000  # of a corpus, or of sample faces
 MAX_FRAMES = 100_000  # of all samples together
 MAX_NOISE_MM = 2.0  # `data.synthetic.noise.MAX_SIGMA_MM`
+EXPORT_MANIFEST = "manifest.json"  # `export.manifest.FILE`
 MESHES = (".ply", ".obj", ".glb", ".npz", ".npy")
 LANDMARKS = (".json", ".pp", ".txt", ".csv", ".xyz", ".lnd", ".bnd", ".npy", ".npz", ".pkl")
 KERNELS = ("gaussian", "multiquadric", "thin_plate", "triharmonic", "wendland_c2")  # of `geometry.rbf`
@@ -221,6 +222,13 @@ def _fit(command: Fit) -> None:
     check_output_folder(command.out.absolute().parent)
 
 
+def _export(command: Export) -> None:
+    labels.read_labels(command.model)
+    if command.out.is_dir() and any(command.out.iterdir()) and not (command.out / EXPORT_MANIFEST).is_file():
+        raise ValueError(f"{command.out}: holds other files than an export; name an empty folder with --out")
+    check_output_folder(command.out)
+
+
 def _view(command: View) -> None:
     page = page_path(command.file, command.out)
     if command.file.suffix.lower() == ".html":
@@ -266,5 +274,6 @@ _CHECKS: dict[type, Any] = {
     MakeHuman: _makehuman,
     Prepare: _prepare,
     Fit: _fit,
+    Export: _export,
     View: _view,
 }

@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 import facejax
-from facejax.cli.arguments import Animate, Command, Data, Demo, Fit, Generate, Labels, Register, View
+from facejax.cli.arguments import Animate, Command, Data, Demo, Export, Fit, Generate, Labels, Register, View
 from facejax.io import errors
 
 DESCRIPTION = (
@@ -75,6 +75,7 @@ _COMMANDS = {
     Labels: _runner("labels"),
     Data: _runner("datasets"),
     Fit: _runner("fit"),
+    Export: _runner("export"),
     View: _runner("view"),
 }
 

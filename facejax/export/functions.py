@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 from jax.interpreters import partial_eval
 
+from facejax.export.signature import Arrays, Dimension, Function, Spec
 from facejax.inference import expressions, pipeline
 from facejax.inference.expressions import Expressions
 from facejax.inference.pipeline import Models, Noise, PreparedFace
@@ -32,68 +32,9 @@ from facejax.models.decoders import gpmm, gpmm_residual, linear
 from facejax.models.motion import generators
 
 NAMES = ("motion", "prepare", "decoder", "decoder_linear", "chain", "lstm")
-Arrays = dict[str, Any]
-
-
-class Dimension(NamedTuple):
-    """A size that is chosen when the function is called: `factor` times a symbol plus `offset`."""
-
-    symbol: str
-    factor: int = 1
-    offset: int = 0
-
-    def __str__(self) -> str:
-        product = self.symbol if self.factor == 1 else f"{self.factor}*{self.symbol}"
-        return f"{product} + {self.offset}" if self.offset else product
-
-
-class Spec(NamedTuple):
-    """Shape and dtype of an array; sizes are numbers or `Dimension`s."""
-
-    shape: tuple[int | Dimension, ...]
-    dtype: str = "float32"
 
 
 BATCH, TRANSITIONS, FRAMES = Dimension("batch"), Dimension("transitions"), Dimension("frames")
-
-
-@dataclasses.dataclass(frozen=True)
-class Function:
-    """A pure function `call(params, *inputs)` that returns a tuple of arrays."""
-
-    name: str
-    call: Callable[..., tuple[jax.Array, ...]]
-    params: Arrays  # arrays by name
-    inputs: dict[str, Spec]
-    outputs: tuple[str, ...]
-
-    @property
-    def symbols(self) -> tuple[str, ...]:
-        """The symbolic dimensions of the inputs, in order."""
-        sizes = [size for spec in self.inputs.values() for size in spec.shape if isinstance(size, Dimension)]
-        return tuple(dict.fromkeys(size.symbol for size in sizes))
-
-    def arguments(self, sizes: Mapping[str, int] | None = None) -> list[jax.ShapeDtypeStruct]:
-        """Return shape and dtype of every input: with given sizes of all symbols, or symbolic ones of `jax.export`."""
-        if sizes is None:
-            scope = export.SymbolicScope()
-            shapes = [
-                export.symbolic_shape(",".join(map(str, spec.shape)), scope=scope) for spec in self.inputs.values()
-            ]
-        else:
-            shapes = [
-                tuple(n if isinstance(n, int) else n.factor * sizes[n.symbol] + n.offset for n in spec.shape)
-                for spec in self.inputs.values()
-            ]
-        return [
-            jax.ShapeDtypeStruct(shape, np.dtype(spec.dtype))
-            for shape, spec in zip(shapes, self.inputs.values(), strict=True)
-        ]
-
-    def outputs_spec(self, sizes: Mapping[str, int] | None = None) -> dict[str, jax.ShapeDtypeStruct]:
-        """Return shape and dtype of every output by name; `sizes` as in `arguments`."""
-        found = jax.eval_shape(self.call, self.params, *self.arguments(sizes))
-        return dict(zip(self.outputs, found, strict=True))
 
 
 def catalogue(
@@ -215,7 +156,8 @@ def _lstm(networks: Expressions) -> Function:
         "known": Spec((), "int32"),
     }
     inputs |= {"neutral": Spec((BATCH, *points))} if from_neutral else {}
-    return _function("lstm", call, {"lstm": networks.params}, inputs, ("curve",))
+    found = _function("lstm", call, {"lstm": networks.params}, inputs, ("curve",))
+    return dataclasses.replace(found, constraints=("frames >= 2",))
 
 
 def _noise(models: Models) -> dict[str, Spec]:

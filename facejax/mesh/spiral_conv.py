@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import export
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -61,11 +62,9 @@ def spiral_conv(
             f"stencil: has {expected} (positions, vertices), expected {(positions, count)} of kernel and x"
         )
     # A symbolic batch (`jax.export`) counts as large.
-    if isinstance(batch, int) and positions * count * batch * out_channels <= _AT_ONCE:
+    if not export.is_symbolic_dim(batch) and positions * count * batch * out_channels <= _AT_ONCE:
         return spiral_conv_at_once(x, kernel, stencil)
-    return jax.lax.platform_dependent(
-        x, kernel, stencil, cpu=spiral_conv_by_position, default=spiral_conv_at_once
-    )
+    return jax.lax.platform_dependent(x, kernel, stencil, cpu=spiral_conv_by_position, default=spiral_conv_at_once)
 
 
 @jax.jit
@@ -79,7 +78,7 @@ def spiral_conv_by_position(
     positions, channels, out_channels = kernel.shape
     count, batch, _ = x.shape
     rows = jnp.reshape(x, (count * batch, channels))
-    if out_channels < _FEW_CHANNELS and (not isinstance(batch, int) or batch >= _FEW_CHANNELS):
+    if out_channels < _FEW_CHANNELS and (export.is_symbolic_dim(batch) or batch >= _FEW_CHANNELS):
         flat_kernel = kernel.transpose(0, 2, 1).reshape(positions * out_channels, channels)
         planes = jax.lax.dot_general(flat_kernel, rows, (((1,), (1,)), ((), ())))
         planes = planes.reshape(positions, out_channels, count, batch)

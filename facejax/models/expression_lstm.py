@@ -198,10 +198,10 @@ def continue_curve(
     time = jnp.arange(frames - 1)[:, None, None]
     given = jnp.where(time < known - 1, jnp.diff(jnp.asarray(curve), axis=-3), 0)
     # Entry t holds the step that led to frame t, as in a training block.
-    steps = jnp.where(time > 0, jnp.roll(given, 1, axis=-3), 0)
+    steps = jnp.concatenate([jnp.zeros_like(jnp.asarray(curve)[..., :1, :, :]), given], axis=-3)[..., :-1, :, :]
     made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
     made = jnp.where(time < known - 1, given, made)
-    curve = jnp.cumsum(jnp.concatenate([jnp.zeros_like(made[..., :1, :, :]), made], axis=-3), axis=-3)
+    curve = jnp.cumsum(jnp.concatenate([jnp.zeros_like(jnp.asarray(curve)[..., :1, :, :]), made], axis=-3), axis=-3)
     last = jnp.where(stop > 0, expression_length(curve, fraction=stop), frames) - 1
     place = jnp.minimum(jnp.arange(frames), last[..., None])
     return jnp.take_along_axis(curve, place[..., None, None], axis=-3)

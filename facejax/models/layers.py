@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import export
 from jaxtyping import Array, Float
 
 from facejax.mesh import spiral_conv as spirals
@@ -59,8 +60,8 @@ def map_pieces(function: Callable[..., Array], arrays: Sequence[Array], most: in
 
     The last piece is padded with copies of the last row. B may be symbolic (`jax.export`).
     """
-    count: Any = arrays[0].shape[0]
-    symbolic = not isinstance(count, int)
+    count = arrays[0].shape[0]
+    symbolic = export.is_symbolic_dim(count)
     pieces = -(-count // most)
     if not symbolic and pieces <= 1:
         return function(*arrays)

@@ -160,7 +160,9 @@ def unpack(tree: dict[str, Any], hierarchy: Hierarchy, faces: Int[np.ndarray, "F
     scale, network = tree["network"]["scale"], tree["network"]
     scale = residual.Scale(**scale) if isinstance(scale, dict) else scale
     return GPMMResidual(
-        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32) if np.asarray(leaf).dtype.kind == "f" else leaf, model),
+        jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float32) if np.asarray(leaf).dtype.kind == "f" else leaf, model
+        ),
         jax.tree.map(jnp.asarray, residual.ResidualDecoder(scale, network["weights"], network["gate"])),
         jax.device_put(hierarchy),
         jax.device_put(strain.vertex_triangles(np.asarray(faces), len(face))),

@@ -109,7 +109,9 @@ def apply(
     stretch, normal = strain.strain(moved, rest, tables)
     position = (rest - scale.face[:, None]) / POSITION_MM
     embedding = jnp.broadcast_to(weights["own"][:, None], (*moved.shape[:2], EMBEDDING))
-    x = (jnp.asarray(displacements) - scale.landmark_mean).reshape(base.shape[0], scale.landmark_mean.size) / scale.landmark_std
+    x = (jnp.asarray(displacements) - scale.landmark_mean).reshape(
+        base.shape[0], scale.landmark_mean.size
+    ) / scale.landmark_std
     decoded = s2d_dec.decode_levels(weights["climb"], hierarchy, x)
     x = jnp.concatenate([stretch / STRAIN, moved / DISPLACEMENT_MM, normal, position, embedding, decoded], axis=-1)
     first, second = weights["mix"]

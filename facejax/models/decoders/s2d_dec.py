@@ -16,6 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Float
 
 from facejax.mesh.hierarchy import Hierarchy
@@ -134,7 +135,7 @@ def apply(
     few = _cpu_chunk(hierarchy)
     if chunk is not None:
         out = in_chunks(chunk)(flat)
-    elif isinstance(flat.shape[0], int) and flat.shape[0] <= few:
+    elif not export.is_symbolic_dim(flat.shape[0]) and flat.shape[0] <= few:
         out = _decode(params, hierarchy, flat)
     else:
         out = jax.lax.platform_dependent(flat, cpu=in_chunks(few), default=in_chunks(CHUNK))
