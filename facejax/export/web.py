@@ -33,7 +33,7 @@ from facejax.io import atomic, cache
 from facejax.viz import eyes_teeth, html_viewer, render, scene
 
 RUNTIME, RUNTIME_VERSION = "onnxruntime-web", "1.23.2"
-RUNTIME_FILES = ("ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm")
+RUNTIME_FILES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm")
 PAGE = ("index.html", "style.css", "app.js", "drawing.js", "generator.js", "motion.js", "worker.js")
 PEOPLE = 3  # of the synthetic population, besides the average face
 Neutral = Float[np.ndarray, "N 3"]

@@ -1,5 +1,5 @@
 // Generates motions beside the page's thread, with ONNX Runtime; see generator.js for the messages.
-import * as ort from "./onnxruntime/ort.wasm.bundle.min.mjs";
+import * as ort from "./onnxruntime/ort.wasm.min.mjs";
 import {sampleNoise, timeline} from "./motion.js";
 
 const CHUNK = 8;  // frames that are decoded at a time, after which they are shown
