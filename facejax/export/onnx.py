@@ -1,18 +1,18 @@
 """Functions as ONNX files, for ONNX Runtime in any language: one folder of NAME.onnx and manifest.json.
 
-    onnx.export(models, "facejax-onnx")
+    onnx.export(models, "runs/onnx")
 
 Weights are inside of each file. The files hold `facejax.export.functions`, with these differences:
 
-    motion           one motion per call: without the batch axis; any number of transitions and frames
-    decoder          as there, any number of frames
-    decoder_linear   as there
-    lstm             one curve per call: without the batch axis; any number of frames
+    motion            one motion per call: without the batch axis; any number of transitions and frames
+    decoder           as there, any number of frames
+    decoder_linear    as there
 
 `prepare` is not among them: its QR factorisation and triangular solve have no operator in ONNX. A face is prepared by
 facejax, and its arrays (`functions.face_arrays`) are inputs of the decoders. `chain` is `motion` followed by `decoder`.
+`lstm` reads a symbolic number of frames in a way that jax2onnx does not convert.
 
-Needs the packages jax2onnx, onnx and onnxruntime.
+Needs the packages jax2onnx, onnx and onnxruntime, see docs/howto/onnx.md.
 """
 
 from __future__ import annotations
@@ -33,15 +33,21 @@ import jax
 from jax.extend import core
 
 from facejax.export import functions as exported
-from facejax.export import onnx_forms, onnx_graph, plain_jaxpr
-from facejax.export.functions import BATCH, Function, Models, Spec
-from facejax.inference.expressions import Expressions
+from facejax.export import manifest, onnx_forms, onnx_graph, plain_jaxpr
+from facejax.export.functions import BATCH
+from facejax.export.signature import Arrays, Function, Spec
+from facejax.inference.pipeline import Models
 from facejax.io import atomic
+from facejax.models.decoders.gpmm_residual import GPMMResidual
 
-NAMES = ("motion", "decoder", "decoder_linear", "lstm")
-OPSET = 21
+NAMES = ("motion", "decoder", "decoder_linear")
+OPSET = 21  # of which ONNX Runtime for browsers has all operators
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 _OPERATORS = {onnx_forms.TAKE: "Gather", onnx_forms.ELU: "Elu"}
+
+
+class PackagesMissing(RuntimeError):
+    """A package that writes ONNX files is not installed."""
 
 
 def export(
@@ -49,72 +55,79 @@ def export(
     out: str | os.PathLike[str],
     *,
     functions: Sequence[str] | None = None,
-    networks: Expressions | None = None,
     opset: int = OPSET,
-) -> Path:
-    """Write functions of models as ONNX files and return the folder, which is replaced on success.
+    command: str = "facejax export onnx",
+) -> list[Path]:
+    """Write functions of models to a folder, which is replaced at the end; return its files, the manifest first.
 
     Args:
       functions: of `NAMES`; default: all that the models have.
-      networks: expression networks for "lstm"; default: the released ones.
       opset: version of the ONNX operators.
+      command: how to write the export again, for the manifest.
 
     Raises:
-      ValueError: an unknown function, or one that the models do not have.
-      ImportError: jax2onnx, onnx or onnxruntime is not installed.
+      ValueError: an unknown function, one that the models do not have, or a folder that holds anything else than an
+        export.
+      PackagesMissing: jax2onnx, onnx or onnxruntime is not installed.
     """
-    found = catalogue(models, functions, networks=networks)
     require_packages()
-    rows: dict[str, Any] = {}
-    with atomic.replace_folder(out) as folder:
-        for name, function in found.items():
-            data = convert(function, opset=opset).SerializeToString()
-            (folder / f"{name}.onnx").write_bytes(data)
-            rows[name] = describe(function) | {"file": f"{name}.onnx", "bytes": len(data)}
-        manifest = {
-            "functions": rows,
-            "labels": list(models.labels),
-            "opset": opset,
-            "versions": {name: metadata.version(name) for name in ("facejax", "jax", *PACKAGES)},
-            "made_by": "facejax export onnx --out DIR",
-            "about": dict(models.about),
-        }
-        text = json.dumps(manifest, indent=2, default=str)
-        (folder / "manifest.json").write_text(text + "\n", "utf-8")
-    return Path(out)
+    out = Path(os.path.abspath(out))
+    manifest.check_folder(out)
+    with jax.enable_x64(False), atomic.replace_folder(out) as folder:
+        names = write(models, folder, functions, opset=opset)
+        write_manifest(models, folder, names, opset=opset, format="onnx", command=command)
+    return [out / name for name in (manifest.FILE, *(f"{name}.onnx" for name in names))]
 
 
-def catalogue(
-    models: Models, names: Sequence[str] | None = None, *, networks: Expressions | None = None
+def write(
+    models: Models, folder: Path, functions: Sequence[str] | None = None, *, opset: int = OPSET
 ) -> dict[str, Function]:
-    """Return the functions that `export` writes, with their inputs as in the files.
+    """Write NAME.onnx of functions to a folder and return the functions."""
+    found = catalogue(models, functions)
+    for name, function in found.items():
+        (folder / f"{name}.onnx").write_bytes(convert(function, opset=opset).SerializeToString())
+    return found
+
+
+def write_manifest(
+    models: Models, folder: Path, functions: dict[str, Function], *, opset: int = OPSET, **fields: Any
+) -> None:
+    """Write the manifest of a folder with functions that `write` returned."""
+    rows: dict[str, Any] = {}
+    for name, function in functions.items():
+        file = folder / f"{name}.onnx"
+        stored = {"file": file.name, "bytes": file.stat().st_size, "sha256": atomic.sha256(file)}
+        described = manifest.describe(function)
+        rows[name] = stored | {"inputs": described["inputs"], "outputs": described["outputs"]}
+    index = {
+        **fields,
+        "version": manifest.VERSION,
+        "versions": {name: metadata.version(name) for name in ("facejax", "jax", *PACKAGES)},
+        "opset": opset,
+        "labels": list(models.labels),
+        "functions": rows,
+    }
+    (folder / manifest.FILE).write_text(json.dumps(index, indent=1) + "\n", "utf-8")
+
+
+def catalogue(models: Models, names: Sequence[str] | None = None) -> dict[str, Function]:
+    """Return the functions that `export` writes, with their inputs as in the files; default: all that models have.
 
     Raises:
       ValueError: an unknown name, or one that the models do not have.
     """
     if unknown := [name for name in names or () if name not in NAMES]:
         raise ValueError(f"functions: expected some of {', '.join(NAMES)}, got {', '.join(unknown)}")
-    own = exported.catalogue(models, names, networks=networks)
-    return {name: _without_batch(function) for name, function in own.items() if name in NAMES}
-
-
-def describe(function: Function) -> dict[str, Any]:
-    """Return the names, shapes and dtypes of inputs and outputs as values for JSON; symbolic sizes are strings."""
-
-    def row(shape: Sequence[Any], dtype: Any) -> dict[str, Any]:
-        return {"shape": [size if isinstance(size, int) else str(size) for size in shape], "dtype": str(dtype)}
-
-    return {
-        "inputs": {name: row(spec.shape, spec.dtype) for name, spec in function.inputs.items()},
-        "outputs": {name: row(one.shape, one.dtype) for name, one in function.outputs_spec().items()},
-    }
+    if names is None:
+        names = [name for name in NAMES if isinstance(models.decoder, GPMMResidual) or name != "decoder_linear"]
+    return {name: _without_batch(function) for name, function in exported.catalogue(models, names).items()}
 
 
 def convert(function: Function, *, opset: int = OPSET) -> Any:
     """Return a function of `catalogue` as an `onnx.ModelProto`, its parameters as constants.
 
     Raises:
-      ImportError: jax2onnx, onnx or onnxruntime is not installed.
+      PackagesMissing: jax2onnx, onnx or onnxruntime is not installed.
     """
     require_packages()
     arguments = function.arguments()
@@ -138,10 +151,9 @@ def convert(function: Function, *, opset: int = OPSET) -> Any:
 
 
 def require_packages() -> None:
-    """Raise `ImportError` that names the packages that are missing."""
-    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ImportError(f"ONNX export needs the packages {', '.join(missing)}: see docs/howto/onnx.md")
+    """Raise `PackagesMissing` that names the packages that are missing."""
+    if missing := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
+        raise PackagesMissing(f"ONNX files need the packages {', '.join(missing)}: see docs/howto/onnx.md")
 
 
 def _without_batch(function: Function) -> Function:
@@ -149,15 +161,15 @@ def _without_batch(function: Function) -> Function:
 
     Whole batches are decoded piece by piece, in numbers that are known when a function is traced.
     """
-    batched = [bool(spec.shape) and spec.shape[0] == BATCH for spec in function.inputs.values()]
+    specs = function.inputs.values()
+    batched = [bool(spec.shape) and spec.shape[0] == BATCH for spec in specs]
+    alone = [Spec(spec.shape[1:], spec.dtype) if lead else spec for spec, lead in zip(specs, batched, strict=True)]
+    single = dataclasses.replace(function, inputs=dict(zip(function.inputs, alone, strict=True)))
     if not function.name.startswith("decoder"):
-        rows = zip(function.inputs.items(), batched, strict=True)
-        inputs = {name: Spec(spec.shape[1:], spec.dtype) if lead else spec for (name, spec), lead in rows}
-        return dataclasses.replace(function, inputs=inputs)
-    alone = [Spec(spec.shape[1:]) if lead else spec for spec, lead in zip(function.inputs.values(), batched, strict=True)]
-    shapes = dataclasses.replace(function, inputs=dict(zip(function.inputs, alone, strict=True))).arguments({})
+        return single
+    shapes = single.arguments({})
 
-    def call(params: exported.Arrays, *inputs: Any) -> tuple[jax.Array, ...]:
+    def call(params: Arrays, *inputs: Any) -> tuple[jax.Array, ...]:
         one = jax.make_jaxpr(lambda *sample: function.call(params, *sample))(*shapes)
         axes = [0 if lead else None for lead in batched]
         return tuple(jax.vmap(lambda *sample: plain_jaxpr.evaluate(one, sample), axes)(*inputs))

@@ -1,6 +1,6 @@
 """A folder of static files: a page that generates new motions in the visitor's browser.
 
-    web.export(models, "site")
+    web.export(models, "runs/web")
 
 The folder holds the page, the functions "motion" and "decoder" as ONNX files, prepared faces, and ONNX Runtime for
 browsers. Any static server serves it; the page asks no other server for anything. See docs/howto/web.md.
@@ -22,14 +22,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from facejax.data.synthetic import assets, makehuman
-from facejax.export import functions, onnx
+from facejax.export import functions, manifest, onnx
 from facejax.inference import pipeline
 from facejax.inference.pipeline import Models
 from facejax.io import atomic, cache
+from facejax.models.motion import generators
 from facejax.viz import eyes_teeth, html_viewer, render, scene
 
 RUNTIME, RUNTIME_VERSION = "onnxruntime-web", "1.23.2"
@@ -49,31 +51,37 @@ def export(
     *,
     faces: Mapping[str, Neutral] | None = None,
     runtime: str | os.PathLike[str] | None = None,
-) -> Path:
-    """Write the page and return its folder, which is replaced on success.
+    command: str = "facejax export web",
+) -> list[Path]:
+    """Write the page to a folder, which is replaced at the end; return its files, the page first.
 
     Args:
       faces: neutral faces (N, 3) in mm by the names that the page shows; default: `default_faces`.
       runtime: a folder of `RUNTIME_FILES`, such as dist of the npm package onnxruntime-web; default: fetched by npm.
 
+      command: how to write the export again, for the manifest.
+
     Raises:
-      ValueError: a face in another topology, or no face.
+      ValueError: a face in another topology, no face, or a folder that holds anything else than an export.
       RuntimeMissing: `runtime` lacks a file, or npm does not fetch the package.
-      ImportError: a package of `onnx.PACKAGES` is not installed.
+      onnx.PackagesMissing: a package of `onnx.PACKAGES` is not installed.
     """
     onnx.require_packages()
+    out = Path(os.path.abspath(out))
+    manifest.check_folder(out)
     found = default_faces(models) if faces is None else dict(faces)
     if not found:
         raise ValueError("faces: expected one or more, got none")
-    with atomic.replace_folder(out) as folder:
+    with jax.enable_x64(False), atomic.replace_folder(out) as folder:
         add_runtime(folder / "onnxruntime", runtime)
         for name in PAGE:
             source = resources.files("facejax.viz").joinpath("web", name)
             (folder / name).write_bytes(source.read_bytes())
-        for name, function in onnx.catalogue(models, ("motion", "decoder")).items():
-            (folder / f"{name}.onnx").write_bytes(onnx.convert(function).SerializeToString())
+        written = onnx.write(models, folder, ("motion", "decoder"))
         _write_model(models, found, folder)
-    return Path(out)
+        onnx.write_manifest(models, folder, written, format="web", command=command, runtime=RUNTIME_VERSION)
+        names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    return [out / name for name in ("index.html", *(name for name in names if name != "index.html"))]
 
 
 def default_faces(models: Models) -> dict[str, Neutral]:
@@ -139,7 +147,7 @@ def _write_model(models: Models, faces: Mapping[str, Neutral], folder: Path) -> 
         "faces": rows,
         "arrays": arrays,
         "drawn": len(models.motion.chart.p) + 1,
-        "noise": {"blur": models.starts.poses.shape[2], "noise": functions.generators.noise_size(models.motion)},
+        "noise": {"blur": models.starts.poses.shape[2], "noise": generators.noise_size(models.motion)},
         "start": _start(list(models.labels)),
         "view": view,
         "lower": {"jaw": jaw.tolist(), "teeth": [view["points"] - last, view["points"]]},
@@ -182,7 +190,10 @@ def _drawing(models: Models, extras: tuple[scene.Part, ...]) -> tuple[dict[str, 
     sizes = [part.vertices.shape[-2] for part in parts]
     offsets = np.cumsum([0, *sizes])
     triangles = [np.asarray(part.faces) + offset for part, offset in zip(parts, offsets, strict=False)]
-    surface = [np.column_stack([scene.colours(part), np.full(size, part.gloss)]) for part, size in zip(parts, sizes, strict=True)]
+    surface = [
+        np.column_stack([scene.colours(part), np.full(size, part.gloss)])
+        for part, size in zip(parts, sizes, strict=True)
+    ]
     view = {
         "points": int(offsets[-1]),
         "face": len(vertices),

@@ -78,19 +78,23 @@ def test_one_file_decodes_any_number_of_frames_of_any_face(decoder):
 @NEEDED
 def test_a_folder_has_the_files_and_a_manifest_and_is_replaced_whole(tmp_path):
     models, out = tiny_models.make(), tmp_path / "onnx"
-    out.mkdir()
-    (out / "old").write_text("")
-    onnx.export(models, out, functions=["decoder_linear"])
+    for _ in range(2):
+        files = onnx.export(models, out, functions=["decoder_linear"])
+    assert files == [out / "manifest.json", out / "decoder_linear.onnx"]
     assert sorted(path.name for path in out.iterdir()) == ["decoder_linear.onnx", "manifest.json"]
     manifest = json.loads((out / "manifest.json").read_text())
     row = manifest["functions"]["decoder_linear"]
     assert row["bytes"] == (out / row["file"]).stat().st_size
-    assert row["inputs"]["landmarks"] == {"shape": ["batch", 4, 3], "dtype": "float32"}
-    assert row["outputs"]["vertices"]["shape"] == ["batch", 162, 3]
+    assert row["inputs"][-1] == {"name": "landmarks", "shape": ["batch", 4, 3], "dtype": "float32"}
+    assert row["outputs"] == [{"name": "vertices", "shape": ["batch", 162, 3], "dtype": "float32"}]
     assert manifest["labels"] == list(models.labels) and manifest["opset"] == onnx.OPSET
     with pytest.raises(ValueError, match="expected some of motion"):
         onnx.export(models, out, functions=["prepare"])
     assert (out / "manifest.json").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes").write_text("")
+    with pytest.raises(ValueError, match="holds other files"):
+        onnx.export(models, tmp_path / "other")
 
 
 @NEEDED
@@ -122,9 +126,7 @@ def test_the_forms_for_onnx_are_equal_up_to_rounding():
         np.testing.assert_allclose(onnx_forms.spiral_conv(x, kernel, stencil), expected, atol=2e-5)
     rest = jnp.asarray(models.face.vertices)[:, None]
     moved = jnp.asarray(rng.normal(size=rest.shape), jnp.float32)
-    for found, expected in zip(
-        onnx_forms.strain(moved, rest, tables), strain.strain(moved, rest, tables), strict=True
-    ):
+    for found, expected in zip(onnx_forms.strain(moved, rest, tables), strain.strain(moved, rest, tables), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-5)
     with pytest.raises(ValueError, match="expected one sample"):
         onnx_forms.spiral_conv(jnp.zeros((len(rest), 2, 6)), kernel, hierarchy.surface)
@@ -132,5 +134,5 @@ def test_the_forms_for_onnx_are_equal_up_to_rounding():
 
 def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setattr(onnx.importlib.util, "find_spec", lambda name: None if name == "onnx" else object())
-    with pytest.raises(ImportError, match="needs the packages onnx:"):
+    with pytest.raises(onnx.PackagesMissing, match="need the packages onnx:"):
         onnx.require_packages()

@@ -14,6 +14,7 @@ async function fetched(name) {
 async function load() {
   // Several threads need headers that static servers do not send.
   ort.env.wasm.numThreads = 1;
+  ort.env.logLevel = "error";
   ort.env.wasm.wasmPaths = new URL("./onnxruntime/", import.meta.url).href;
   model = await (await fetched("model.json")).json();
   const open = async name => ort.InferenceSession.create(
