@@ -28,8 +28,8 @@ from jaxlib import version as jaxlib_version
 import facejax
 from facejax.export import functions as catalogue
 from facejax.export import manifest
-from facejax.export.signature import Dimension, Function, Spec
 from facejax.export.manifest import ExportError
+from facejax.export.signature import Dimension, Function, Spec
 from facejax.inference import expressions
 from facejax.inference.expressions import Expressions
 from facejax.inference.pipeline import Models

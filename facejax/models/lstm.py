@@ -88,8 +88,8 @@ def step(weights: Weights, states: list[State], x: Float[Array, "B D"]) -> tuple
     return after, dense_layers.dense(weights["dense"], x)
 
 
-def init_states(weights: Weights, count: int) -> list[State]:
-    """Return the zero initial states of `count` sequences."""
+def init_states(weights: Weights, count: Any) -> list[State]:
+    """Return the zero initial states of `count` sequences; the number may be symbolic (`jax.export`)."""
     zeros = [jnp.zeros((count, row["hidden"].shape[0]), row["hidden"].dtype) for row in weights["layers"]]
     return [(zero, zero) for zero in zeros]
 
