@@ -43,6 +43,7 @@ from facejax.models.decoders.gpmm_residual import GPMMResidual
 NAMES = ("motion", "decoder", "decoder_linear")
 OPSET = 21  # of which ONNX Runtime for browsers has all operators
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
+CONVERTER = "0.17.1"  # of jax2onnx; it asks for an older orbax-checkpoint than facejax, and uses none of it
 _OPERATORS = {onnx_forms.TAKE: "Gather", onnx_forms.ELU: "Elu"}
 
 
@@ -153,7 +154,10 @@ def convert(function: Function, *, opset: int = OPSET) -> Any:
 def require_packages() -> None:
     """Raise `PackagesMissing` that names the packages that are missing."""
     if missing := [name for name in PACKAGES if importlib.util.find_spec(name) is None]:
-        raise PackagesMissing(f"ONNX files need the packages {', '.join(missing)}: see docs/howto/onnx.md")
+        raise PackagesMissing(
+            f"ONNX files need the packages {', '.join(missing)}: run `pip install 'facejax[onnx]'` and "
+            f"`pip install --no-deps jax2onnx=={CONVERTER}`"
+        )
 
 
 def _without_batch(function: Function) -> Function:

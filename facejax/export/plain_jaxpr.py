@@ -97,7 +97,8 @@ def _scan(params: dict[str, Any], inputs: list[Any]) -> Sequence[Any]:
     if not export.is_symbolic_dim(length) and length == 1:
         carry, made = advance(start, [row[0] for row in rows])
         return [*carry, *(jnp.asarray(one)[None] for one in made)]
-    carry, made = jax.lax.scan(advance, start, rows, length=None if rows else length, reverse=params["reverse"])
+    # The length is that of the rows; `scan` takes no symbolic one.
+    carry, made = jax.lax.scan(advance, start, rows, length=None if rows else int(length), reverse=params["reverse"])
     return [*carry, *made]
 
 
