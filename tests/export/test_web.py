@@ -25,8 +25,6 @@ RUNTIME = os.environ.get("ONNXRUNTIME_WEB")  # dist of the npm package
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
-    extensions_map = {**http.server.SimpleHTTPRequestHandler.extensions_map, ".mjs": "text/javascript"}
-
     def log_message(self, *_):
         pass
 
@@ -37,6 +35,7 @@ def serve():
     servers = []
 
     def start(folder):
+        Quiet.extensions_map[".mjs"] = "text/javascript"
         handler = functools.partial(Quiet, directory=str(folder))
         server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
         threading.Thread(target=server.serve_forever, daemon=True).start()
