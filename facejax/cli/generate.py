@@ -1,4 +1,4 @@
-"""`facejax generate`: animate a neutral face, or a scan of a head, through expressions."""
+"""`facejax generate`: animate a neutral face, or a scan of a head, through expressions; write a corpus of motions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ import numpy as np
 
 from facejax.cli import checks, inputs, outputs, runtime
 from facejax.cli.arguments import Generate
-from facejax.data.synthetic import assets
-from facejax.inference import motion_sources, pipeline, scans
+from facejax.data.synthetic import assets, makehuman
+from facejax.inference import corpus, motion_sources, pipeline, scans
 
 
 def run(command: Generate) -> None:
     """Write every sample in every format, or with --count a corpus."""
     if command.count is not None:
-        from facejax.cli import corpus
-
-        return corpus.run(command)
+        return _run_corpus(command)
     assert command.end is not None  # ensured by `checks.check`
     bound = None
     if command.landmarks is None or command.face is None:
@@ -89,3 +87,33 @@ def generate(
         written.append(outputs.save_landmarks(path, np.asarray(landmarks), labels, frames, fps))
         advance()
     return written
+
+
+def _run_corpus(command: Generate) -> None:
+    """Write what is missing of a corpus and print the path of its index."""
+    assert command.count is not None and not isinstance(command.frames, str)  # ensured by `checks.check`
+    if command.distributed:
+        runtime.join_distributed()
+    runtime.configure()
+    labels = () if command.end is None else (command.start, command.end, *command.then)
+    request = corpus.Request(
+        command.count, labels, command.seed, command.frames, command.intensity, command.meshes, command.shard
+    )
+    models = pipeline.load(command.model)
+    neutrals, notes = _faces(models, command.face, command.people, command.model)
+    outputs.make_output_folder(command.out)
+    with outputs.progress(command.out.name, None) as advance:
+        found = corpus.generate(models, request, neutrals, command.out, progress=advance)
+    outputs.report([found.path / "index.json"], notes)
+
+
+def _faces(
+    models: pipeline.Models, face: Path | None, people: int, model: Path | None
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Return neutral faces (N, 3) by name, and notes on what was assumed."""
+    if people:
+        if not np.array_equal(models.face.faces, assets.load().faces):
+            raise ValueError(f"{model}: expected MakeHuman's topology, which --people needs; leave out --people")
+        return {who.name: who.vertices for who in map(makehuman.subject, range(people))}, []
+    vertices, notes = inputs.read_neutral(face, model)
+    return {"average" if face is None else face.stem: vertices}, [f"{face}: {note}" for note in notes]

@@ -1,6 +1,7 @@
 """Spiral convolution, compared with gathering whole spirals and multiplying."""
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import trimesh
 from jax.test_util import check_grads
 
-from facejax.mesh import hierarchy, spiral_conv
+from facejax.mesh import hierarchy, spiral_conv, stencils
 
 BALL = trimesh.creation.icosphere(subdivisions=2)  # 162 vertices
 HIERARCHY = hierarchy.build(np.asarray(BALL.vertices), np.asarray(BALL.faces), factors=(4,), lengths=(9,), reference=0)
@@ -109,3 +110,31 @@ def test_wrong_shapes_are_named(monkeypatch):
         spiral_conv.spiral_conv(x, kernel[1:], stencil)
     with pytest.raises(ValueError, match="stencil: has"):
         spiral_conv.spiral_conv(x[1:], kernel, stencil)
+
+
+def test_the_form_belongs_to_the_platform_that_is_compiled_for():
+    x, kernel, stencil = case(
+        HIERARCHY, lift=True, batch=200, channels=4, out=16
+    )  # too large for all positions at once
+    traced = jax.jit(spiral_conv.spiral_conv).trace(x, kernel, stencil)
+    assert "stablehlo.while" in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert "stablehlo.while" not in traced.lower(lowering_platforms=("cuda",)).as_text()
+
+
+def test_maps_without_their_transpose_give_the_same():
+    x, kernel, stencil = case(HIERARCHY, lift=True, batch=2, channels=3, out=4)
+    found = spiral_conv.spiral_conv(x, kernel, stencils.without_transpose(stencil))
+    np.testing.assert_array_equal(found, spiral_conv.spiral_conv(x, kernel, stencil))
+
+
+def test_a_symbolic_batch_is_exported():
+    _, kernel, stencil = case(HIERARCHY, lift=True, batch=1, channels=3, out=4)
+    (batch,) = jax.export.symbolic_shape("batch")
+    count = HIERARCHY.sizes[1]
+    symbolic = jax.ShapeDtypeStruct((count, batch, 3), jnp.float32)
+    exported = jax.export.export(jax.jit(spiral_conv.spiral_conv))(symbolic, kernel, stencil)
+    for size in (1, 9):
+        x = array(5, count, size, 3)
+        np.testing.assert_allclose(
+            exported.call(x, kernel, stencil), spiral_conv.spiral_conv(x, kernel, stencil), atol=1e-5
+        )
