@@ -90,11 +90,16 @@ def xoshiro(seed, count):
         state[3] = turn(state[3], 11)
 
 
-def test_timeline_and_random_numbers_of_the_page(node):
+def test_timeline_random_numbers_and_rigid_motions_of_the_page(node):
     cases = [([30], 30), ([2, 2], 30), ([30, 12, 2, 45], 30), ([4, 9, 5], 6), ([7, 3], 2)]
     jobs = [{"frames": frames, "drawn": drawn} for frames, drawn in cases]
     file = str(resources.files("facejax.viz").joinpath("web", "motion.js"))
-    found = node("motion.cjs", {"file": file, "seed": 7, "timelines": jobs})
+    source = np.random.default_rng(0).normal(size=(9, 3)) * [30, 5, 20]
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    points = {"source": source.ravel().tolist(), "target": (source @ turn.T + [1, 2, 3]).ravel().tolist()}
+    found = node("motion.cjs", {"file": file, "seed": 7, "timelines": jobs, **points})
+    np.testing.assert_allclose(found["rigid"]["rotation"], turn, atol=1e-6)
+    np.testing.assert_allclose(found["rigid"]["to"], turn @ found["rigid"]["from"] + [1, 2, 3], atol=1e-6)
     for (frames, drawn), values in zip(cases, found["timelines"], strict=True):
         expected = composition.timeline(frames, drawn=drawn)
         np.testing.assert_allclose(np.reshape(values, expected.shape), expected, atol=1e-6)

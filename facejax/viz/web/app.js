@@ -1,6 +1,7 @@
 // The page: labels, face, intensity and seed in; a head that moves out.
 import {createDrawing} from "./drawing.js";
 import {Generator} from "./generator.js";
+import {rigidFit} from "./motion.js";
 
 const $ = id => document.getElementById(id);
 const FPS = 30, canvas = $("view");
@@ -15,11 +16,11 @@ async function main() {
   const space = () => ({top: $("caption").getBoundingClientRect().bottom, bottom: canvas.getBoundingClientRect().bottom - 12});
   const drawing = createDrawing(canvas, model.view, decode(model.triangles, Uint32Array), surface, space, () => dirty = true);
 
-  let sequence = model.start, shown = null, extras = null, made = 0, frames = 0, frame = 0, playing = true, last = 0, at = -1, spoken = "";
+  let sequence = model.start, shown = null, extras = null, face = 0, made = 0, frames = 0, frame = 0, playing = true, last = 0, at = -1, spoken = "";
   let stamps = [], drawn = 0;
 
-  function show(now) {
-    [shown, extras, frames, made, at] = [now.vertices, now.extras, now.frames, now.made, -1];
+  function show(now, index) {
+    [shown, extras, face, frames, made, at] = [now.vertices, now.extras, index, now.frames, now.made, -1];
     frame = Math.min(frame, frames - 1);
     $("time").max = frames - 1;
     dirty = true;
@@ -27,11 +28,11 @@ async function main() {
 
   async function generate() {
     $("strength").textContent = Number($("intensity").value).toFixed(2);
-    const begin = performance.now();
+    const begin = performance.now(), index = $("face").selectedIndex;
     try {
       const done = await generator.generate({
-        labels: sequence, seed: $("seed").valueAsNumber >>> 0, face: $("face").selectedIndex,
-        intensity: $("intensity").valueAsNumber, onFrames: show,
+        labels: sequence, seed: $("seed").valueAsNumber >>> 0, face: index,
+        intensity: $("intensity").valueAsNumber, onFrames: now => show(now, index),
       });
       if (!done) return;
       const total = performance.now() - begin;
@@ -98,11 +99,17 @@ async function main() {
       positions[i] = a + part * (shown[high * stride + i] - a);
     }
     positions.set(extras, stride);
-    // The lower teeth move with the jaw: by the mean of its landmarks.
+    // The lower teeth move with the landmarks of the jaw.
     const {jaw, teeth} = model.lower;
-    for (let axis = 0; axis < 3 && jaw.length; axis++) {
-      const moved = jaw.reduce((sum, v, k) => sum + positions[3 * v + axis] - model.faces[$("face").selectedIndex].jaw[3 * k + axis], 0) / jaw.length;
-      for (let i = teeth[0]; i < teeth[1]; i++) positions[3 * i + axis] += moved;
+    if (!jaw.length) return;
+    const moved = jaw.flatMap(v => [...positions.subarray(3 * v, 3 * v + 3)]);
+    const {rotation, from, to} = rigidFit(model.faces[face].jaw, moved);
+    for (let i = 3 * teeth[0]; i < 3 * teeth[1]; i += 3) {
+      const arm = [positions[i] - from[0], positions[i + 1] - from[1], positions[i + 2] - from[2]];
+      for (let axis = 0; axis < 3; axis++) {
+        const [x, y, z] = rotation[axis];
+        positions[i + axis] = to[axis] + x * arm[0] + y * arm[1] + z * arm[2];
+      }
     }
   }
 

@@ -97,3 +97,42 @@ function cubicRows(count, drawn) {
   }
   return rows;
 }
+
+// The rigid motion that takes points (3 numbers each) closest to others: {rotation: 3 rows, from, to: the two centres}.
+// The rotation is the quaternion of Horn 1987, the leading eigenvector of a 4 x 4 matrix, by repeated squaring.
+export function rigidFit(source, target) {
+  const count = source.length / 3, centre = points => [0, 1, 2].map(axis => {
+    let sum = 0;
+    for (let i = axis; i < points.length; i += 3) sum += points[i];
+    return sum / count;
+  });
+  const from = centre(source), to = centre(target), s = [[0, 0, 0], [0, 0, 0], [0, 0, 0]];
+  for (let i = 0; i < source.length; i += 3) {
+    for (let a = 0; a < 3; a++) for (let b = 0; b < 3; b++) s[a][b] += (source[i + a] - from[a]) * (target[i + b] - to[b]);
+  }
+  const [[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]] = s;
+  const matrix = [
+    [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+    [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+    [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+    [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+  ];
+  // Shifted so that the largest eigenvalue is also the largest in size.
+  const shift = Math.max(...matrix.map(row => row.reduce((sum, x) => sum + Math.abs(x), 0))) || 1;
+  let power = matrix.map((row, i) => row.map((x, k) => (x + (i === k ? shift : 0)) / (2 * shift)));
+  for (let step = 0; step < 16; step++) {
+    const next = power.map(row => row.map((_, k) => row.reduce((sum, x, i) => sum + x * power[i][k], 0)));
+    const size = Math.max(...next.flat().map(Math.abs));
+    power = next.map(row => row.map(x => x / size));
+  }
+  // Every column is a multiple of the eigenvector; the one with the largest diagonal entry is the most accurate.
+  const column = [0, 1, 2, 3].reduce((best, k) => power[k][k] > power[best][best] ? k : best);
+  const length = Math.hypot(...power.map(row => row[column])), q = power.map(row => row[column] / length);
+  const [w, x, y, z] = q;
+  const rotation = [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+  return {rotation, from, to};
+}
