@@ -118,7 +118,8 @@ def add_runtime(folder: Path, source: str | os.PathLike[str] | None = None) -> N
         done = subprocess.run(command, cwd=temporary, capture_output=True, text=True, check=False)
         archives = list(Path(temporary).glob("*.tgz"))
         if done.returncode or not archives:
-            reason = (done.stderr.strip().splitlines() or ["no output"])[-1]
+            lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+            reason = next((line for line in lines if "error" in line.lower()), lines[-1] if lines else "no output")
             raise RuntimeMissing(f"npm does not fetch {package} ({reason}); {manual}")
         with tarfile.open(archives[0]) as archive:
             for name in RUNTIME_FILES:
