@@ -243,7 +243,9 @@ class Export:
     model: Path | None = None
     """Model file; default: the released models."""
     functions: tuple[str, ...] = ()
-    """Names of functions, such as `decoder`; default: all of the format."""
+    """Names of functions, such as `decoder`; default: all of the format. Not with web."""
+    runtime: Path | None = None
+    """For web: folder `dist` of the npm package onnxruntime-web; default: fetched by npm."""
 
 
 @dataclasses.dataclass(frozen=True)

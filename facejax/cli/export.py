@@ -14,11 +14,17 @@ from facejax.inference import pipeline
 
 def run(command: Export) -> None:
     """Write the export and print the paths of its files."""
+    if command.format == "web" and command.functions:
+        raise ValueError("--functions: not supported by web, which always holds motion and decoder")
+    if command.format != "web" and command.runtime is not None:
+        raise ValueError(f"--runtime: for web only, not for {command.format}")
     exporter = _exporter(command.format)
     runtime.configure()
     options: dict[str, Any] = {"command": _again(command)}
     if command.functions:
         options["functions"] = command.functions
+    if command.runtime is not None:
+        options["runtime"] = command.runtime
     outputs.report(exporter.export(pipeline.load(command.model), command.out, **options))
 
 
@@ -37,4 +43,6 @@ def _again(command: Export) -> str:
         words += ["--model", str(command.model)]
     if command.functions:
         words += ["--functions", *command.functions]
+    if command.runtime is not None:
+        words += ["--runtime", str(command.runtime)]
     return shlex.join(words)

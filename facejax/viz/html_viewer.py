@@ -13,6 +13,7 @@ import string
 import zlib
 from collections.abc import Sequence
 from importlib import resources
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,10 +53,30 @@ def write(
       ValueError: invalid arrays, see `scene.make`.
     """
     animation = scene.make(vertices, faces, fps=fps, captions=captions, landmarks=landmarks, extras=extras)
-    page = string.Template(resources.files("facejax.viz").joinpath("viewer.html").read_text("utf-8"))
-    text = page.substitute(_fields(animation, str(title), colours))
+    folder = resources.files("facejax.viz")
+    page = string.Template(folder.joinpath("viewer.html").read_text("utf-8"))
+    # The script of the page is no module.
+    drawing = folder.joinpath("web", "drawing.js").read_text("utf-8").partition("\nexport {")[0]
+    text = page.substitute(_fields(animation, str(title), colours), drawing=drawing)
     with atomic.replace_file(path) as temporary:
         temporary.write_text(text, "utf-8")
+
+
+def camera_and_light(vertices: np.ndarray) -> dict[str, Any]:
+    """Return the camera that shows vertices (T, N, 3) from the front, and the light, as `drawing.js` reads them."""
+    view = render.fit_camera(vertices, size=_ASPECT, margin=0.03)
+    centre = (vertices.min((0, 1)) + vertices.max((0, 1))).astype(np.float64) / 2
+    return {
+        "target": centre.tolist(),
+        "distance": float(view.eye[2] - centre[2]),
+        "zoom": view.zoom,
+        "aspect": _ASPECT[0] / _ASPECT[1],
+        "light": [(np.array(direction) / np.linalg.norm(direction)).tolist() for direction, _ in shading.LIGHTS],
+        "tint": [colour for _, colour in shading.LIGHTS],
+        "sky": shading.SKY,
+        "ground": shading.GROUND,
+        "inside": shading.INSIDE,
+    }
 
 
 def _fields(animation: scene.Scene, title: str, colours: ArrayLike | None) -> dict[str, str]:
@@ -76,8 +97,6 @@ def _fields(animation: scene.Scene, title: str, colours: ArrayLike | None) -> di
         surface.append(np.zeros((marks, 4)))
     points = np.concatenate(layers, 1)
     packed, origin, step = _quantise(points)
-    view = render.fit_camera(animation.vertices, size=_ASPECT, margin=0.03)
-    centre = (animation.vertices.min((0, 1)) + animation.vertices.max((0, 1))).astype(np.float64) / 2
     meta = {
         "frames": count,
         "points": points.shape[1],
@@ -88,15 +107,7 @@ def _fields(animation: scene.Scene, title: str, colours: ArrayLike | None) -> di
         "captions": animation.captions,
         "origin": origin.tolist(),
         "step": step,
-        "target": centre.tolist(),
-        "distance": float(view.eye[2] - centre[2]),
-        "zoom": view.zoom,
-        "aspect": _ASPECT[0] / _ASPECT[1],
-        "light": [(np.array(direction) / np.linalg.norm(direction)).tolist() for direction, _ in shading.LIGHTS],
-        "tint": [colour for _, colour in shading.LIGHTS],
-        "sky": shading.SKY,
-        "ground": shading.GROUND,
-        "inside": shading.INSIDE,
+        **camera_and_light(animation.vertices),
     }
     return {
         "title": html.escape(title),
