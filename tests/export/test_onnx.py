@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 from facejax.export import functions, onnx, onnx_forms, onnx_graph
-from facejax.inference import composition, pipeline
+from facejax.inference import pipeline
 from facejax.mesh import spiral_conv, strain
+from facejax.models import expression_lstm
 from tests import tiny_models
+from tests.export import exports
 
 TOLERANCE_MM = 1e-4
 NEEDED = pytest.mark.skipif(
@@ -35,27 +37,39 @@ def run(proto, inputs):
     return session.run(None, {name: np.asarray(value) for name, value in inputs.items()})
 
 
-def motion_inputs(models, labels, frames, *, intensity):
-    """Noise of a key, and the rest of the inputs of "motion"."""
-    noise = pipeline.sample_noise(models, jax.random.key(3), np.asarray(labels))
-    face = pipeline.prepare(models, models.face.vertices)
-    return noise, face, {
-        "choice": noise.choice, "blur": noise.blur, "noise": noise.transitions, "labels": np.array(labels, np.int32),
-        "timeline": composition.timeline(frames, drawn=len(models.motion.chart.p) + 1),
-        "rest": face.landmarks, "size": face.size, "intensity": np.float32(intensity),
-    }  # fmt: skip
+@NEEDED
+@pytest.mark.parametrize("generator", ["flow", "gan"])
+def test_one_file_makes_batches_of_motions_of_any_number_of_transitions_and_frames(generator):
+    models = tiny_models.make(generator=generator)
+    function, proto = converted("motion", generator=generator)
+    for batch, frames in ((1, [7]), (3, [4, 9])):
+        arrays, _, expected = exports.inputs(models, batch=batch, frames=frames)
+        (found,) = run(proto, {name: arrays[name] for name in function.inputs})
+        np.testing.assert_allclose(found, expected, atol=TOLERANCE_MM)
 
 
 @NEEDED
-@pytest.mark.parametrize("generator", ["flow", "gan"])
-def test_one_file_makes_motions_of_any_number_of_transitions_and_frames(generator):
-    models = tiny_models.make(generator=generator)
-    _, proto = converted("motion", generator=generator)
-    for labels, frames in (([0, 1], [7]), ([2, 0, 1, 2], [4, 9, 2])):
-        noise, face, inputs = motion_inputs(models, labels, frames, intensity=1.3)
+def test_the_chain_makes_batches_of_vertices():
+    models = tiny_models.make()
+    function, proto = converted("chain")
+    arrays, face, motion = exports.inputs(models, batch=3, frames=[4, 9])  # as for the motion: compiled already
+    (found,) = run(proto, {name: arrays[name] for name in function.inputs})
+    np.testing.assert_allclose(found, pipeline.vertices(models, face, motion), atol=TOLERANCE_MM)
+
+
+@NEEDED
+@pytest.mark.parametrize("start", expression_lstm.STARTS)
+def test_one_file_continues_curves_of_any_number_of_frames(start):
+    function = onnx.catalogue(tiny_models.make(), ["lstm"], networks=exports.networks(start=start))["lstm"]
+    proto, rng = onnx.convert(function), np.random.default_rng(0)
+    for batch, frames, known, label in ((1, 2, 1, 0), (3, 9, 4, 1), (2, 5, 5, 0)):
+        inputs = {
+            "label": np.int32(label), "known": np.int32(known),
+            "curve": 0.1 * rng.normal(size=(batch, frames, 4, 3)), "neutral": rng.normal(size=(batch, 4, 3)),
+        }  # fmt: skip
+        inputs = {name: np.asarray(inputs[name], spec.dtype) for name, spec in function.inputs.items()}
         (found,) = run(proto, inputs)
-        expected = pipeline.motion_from_noise(models, noise, np.array(labels), face, frames=frames, intensity=1.3)
-        np.testing.assert_allclose(found, expected, atol=TOLERANCE_MM)
+        np.testing.assert_allclose(found, function.call(function.params, *inputs.values())[0], atol=1e-5)
 
 
 @NEEDED
