@@ -22,9 +22,12 @@ NEEDED = pytest.mark.skipif(
 )
 
 
+models_of = functools.cache(tiny_models.make)
+
+
 @functools.cache
 def converted(name, **options):
-    function = onnx.catalogue(tiny_models.make(**options), [name])[name]
+    function = onnx.catalogue(models_of(**options), [name])[name]
     return function, onnx.convert(function)
 
 
@@ -40,7 +43,7 @@ def run(proto, inputs):
 @NEEDED
 @pytest.mark.parametrize("generator", ["flow", "gan"])
 def test_one_file_makes_batches_of_motions_of_any_number_of_transitions_and_frames(generator):
-    models = tiny_models.make(generator=generator)
+    models = models_of(generator=generator)
     function, proto = converted("motion", generator=generator)
     for batch, frames in ((1, [7]), (3, [4, 9])):
         arrays, _, expected = exports.inputs(models, batch=batch, frames=frames)
@@ -50,7 +53,7 @@ def test_one_file_makes_batches_of_motions_of_any_number_of_transitions_and_fram
 
 @NEEDED
 def test_the_chain_makes_batches_of_vertices():
-    models = tiny_models.make()
+    models = models_of()
     function, proto = converted("chain")
     arrays, face, motion = exports.inputs(models, batch=3, frames=[4, 9])  # as for the motion: compiled already
     (found,) = run(proto, {name: arrays[name] for name in function.inputs})
@@ -60,7 +63,7 @@ def test_the_chain_makes_batches_of_vertices():
 @NEEDED
 @pytest.mark.parametrize("start", expression_lstm.STARTS)
 def test_one_file_continues_curves_of_any_number_of_frames(start):
-    function = onnx.catalogue(tiny_models.make(), ["lstm"], networks=exports.networks(start=start))["lstm"]
+    function = onnx.catalogue(models_of(), ["lstm"], networks=exports.networks(start=start))["lstm"]
     proto, rng = onnx.convert(function), np.random.default_rng(0)
     for batch, frames, known, label in ((1, 2, 1, 0), (3, 9, 4, 1), (2, 5, 5, 0)):
         inputs = {
@@ -75,7 +78,7 @@ def test_one_file_continues_curves_of_any_number_of_frames(start):
 @NEEDED
 @pytest.mark.parametrize("decoder", ["gpmm", "s2d"])
 def test_one_file_decodes_any_number_of_frames_of_any_face(decoder):
-    models = tiny_models.make(decoder=decoder)
+    models = models_of(decoder=decoder)
     names = ["decoder", "decoder_linear"] if decoder == "gpmm" else ["decoder"]
     for name in names:
         function, proto = converted(name, decoder=decoder)
@@ -91,7 +94,7 @@ def test_one_file_decodes_any_number_of_frames_of_any_face(decoder):
 
 @NEEDED
 def test_a_folder_has_the_files_and_a_manifest_and_is_replaced_whole(tmp_path):
-    models, out = tiny_models.make(), tmp_path / "onnx"
+    models, out = models_of(), tmp_path / "onnx"
     for _ in range(2):
         files = onnx.export(models, out, functions=["decoder_linear"])
     assert files == [out / "manifest.json", out / "decoder_linear.onnx"]
@@ -130,7 +133,7 @@ def test_loops_pass_on_nothing_that_does_not_change():
 
 
 def test_the_forms_for_onnx_are_equal_up_to_rounding():
-    models = tiny_models.make()
+    models = models_of()
     tables, hierarchy = models.decoder.tables, models.hierarchy
     rng = np.random.default_rng(0)
     for stencil in (*hierarchy.climbs, hierarchy.surface):
