@@ -156,7 +156,7 @@ def _lstm(networks: Expressions) -> Function:
         "known": Spec((), "int32"),
     }
     inputs |= {"neutral": Spec((BATCH, *points))} if from_neutral else {}
-    found = _function("lstm", call, {"lstm": networks.params}, inputs, ("curve",))
+    found = _function("lstm", call, {"lstm": networks.params}, inputs, ("continued",))
     return dataclasses.replace(found, constraints=("frames >= 2",))
 
 

@@ -2,15 +2,11 @@
 
     onnx.export(models, "runs/onnx")
 
-Weights are inside of each file. The files hold `facejax.export.functions`, with these differences:
-
-    motion            one motion per call: without the batch axis; any number of transitions and frames
-    decoder           as there, any number of frames
-    decoder_linear    as there
+Weights are inside of each file. The files hold `facejax.export.functions`, with the same inputs and outputs: any number
+of samples, transitions and frames. Motions of a batch are computed one after another.
 
 `prepare` is not among them: its QR factorisation and triangular solve have no operator in ONNX. A face is prepared by
-facejax, and its arrays (`functions.face_arrays`) are inputs of the decoders. `chain` is `motion` followed by `decoder`.
-`lstm` reads a symbolic number of frames in a way that jax2onnx does not convert.
+facejax, and its arrays (`functions.face_arrays`) are inputs of the decoders and of the chain.
 
 Needs the packages jax2onnx, onnx and onnxruntime, see docs/howto/onnx.md.
 """
@@ -30,21 +26,26 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend import core
+from jax.interpreters import partial_eval
 
 from facejax.export import functions as exported
 from facejax.export import manifest, onnx_forms, onnx_graph, plain_jaxpr
 from facejax.export.functions import BATCH
 from facejax.export.signature import Arrays, Function, Spec
+from facejax.inference import expressions
+from facejax.inference.expressions import Expressions
 from facejax.inference.pipeline import Models
 from facejax.io import atomic
 from facejax.models.decoders.gpmm_residual import GPMMResidual
 
-NAMES = ("motion", "decoder", "decoder_linear")
+NAMES = ("motion", "decoder", "decoder_linear", "chain", "lstm")
 OPSET = 21  # of which ONNX Runtime for browsers has all operators
 PACKAGES = ("jax2onnx", "onnx", "onnxruntime")
 CONVERTER = "0.17.1"  # of jax2onnx; it asks for an older orbax-checkpoint than facejax, and uses none of it
-_OPERATORS = {onnx_forms.TAKE: "Gather", onnx_forms.ELU: "Elu"}
+_LOOPED = ("motion", "chain")  # over the batch; the others compute all samples at once
+_SAMPLE = "_sample"  # after a name: of one sample of the batch
 
 
 class PackagesMissing(RuntimeError):
@@ -56,6 +57,7 @@ def export(
     out: str | os.PathLike[str],
     *,
     functions: Sequence[str] | None = None,
+    networks: Expressions | None = None,
     opset: int = OPSET,
     command: str = "facejax export onnx",
 ) -> list[Path]:
@@ -63,6 +65,7 @@ def export(
 
     Args:
       functions: of `NAMES`; default: all that the models have.
+      networks: expression networks of "lstm"; default: the released ones.
       opset: version of the ONNX operators.
       command: how to write the export again, for the manifest.
 
@@ -75,16 +78,24 @@ def export(
     out = Path(os.path.abspath(out))
     manifest.check_folder(out)
     with jax.enable_x64(False), atomic.replace_folder(out) as folder:
-        names = write(models, folder, functions, opset=opset)
-        write_manifest(models, folder, names, opset=opset, format="onnx", command=command)
-    return [out / name for name in (manifest.FILE, *(f"{name}.onnx" for name in names))]
+        if networks is None and (functions is None or "lstm" in functions):
+            networks = expressions.load()
+        found = write(models, folder, functions, networks=networks, opset=opset)
+        named = [] if networks is None else list(networks.labels)
+        write_manifest(models, folder, found, opset=opset, format="onnx", command=command, expressions=named)
+    return [out / name for name in (manifest.FILE, *(f"{name}.onnx" for name in found))]
 
 
 def write(
-    models: Models, folder: Path, functions: Sequence[str] | None = None, *, opset: int = OPSET
+    models: Models,
+    folder: Path,
+    functions: Sequence[str] | None = None,
+    *,
+    networks: Expressions | None = None,
+    opset: int = OPSET,
 ) -> dict[str, Function]:
     """Write NAME.onnx of functions to a folder and return the functions."""
-    found = catalogue(models, functions)
+    found = catalogue(models, functions, networks=networks)
     for name, function in found.items():
         (folder / f"{name}.onnx").write_bytes(convert(function, opset=opset).SerializeToString())
     return found
@@ -111,8 +122,10 @@ def write_manifest(
     (folder / manifest.FILE).write_text(json.dumps(index, indent=1) + "\n", "utf-8")
 
 
-def catalogue(models: Models, names: Sequence[str] | None = None) -> dict[str, Function]:
-    """Return the functions that `export` writes, with their inputs as in the files; default: all that models have.
+def catalogue(
+    models: Models, names: Sequence[str] | None = None, *, networks: Expressions | None = None
+) -> dict[str, Function]:
+    """Return the functions that `export` writes, in forms that `convert` takes; arguments as of `export`.
 
     Raises:
       ValueError: an unknown name, or one that the models do not have.
@@ -121,7 +134,12 @@ def catalogue(models: Models, names: Sequence[str] | None = None) -> dict[str, F
         raise ValueError(f"functions: expected some of {', '.join(NAMES)}, got {', '.join(unknown)}")
     if names is None:
         names = [name for name in NAMES if isinstance(models.decoder, GPMMResidual) or name != "decoder_linear"]
-    return {name: _without_batch(function) for name, function in exported.catalogue(models, names).items()}
+    parts = ("motion", "decoder") if "chain" in names else ()
+    found = exported.catalogue(models, [*dict.fromkeys((*names, *parts))], networks=networks)
+    found |= {name: _by_sample(one) for name, one in found.items() if name.startswith("decoder")}
+    if "chain" in names:
+        found["chain"] = _in_sequence(found["chain"], found["motion"], found["decoder"])
+    return {name: found[name] for name in names}
 
 
 def convert(function: Function, *, opset: int = OPSET) -> Any:
@@ -131,23 +149,33 @@ def convert(function: Function, *, opset: int = OPSET) -> Any:
       PackagesMissing: jax2onnx, onnx or onnxruntime is not installed.
     """
     require_packages()
-    arguments = function.arguments()
+    looped = function.name in _LOOPED
+    batched = {name for name, spec in function.inputs.items() if looped and spec.shape[:1] == (BATCH,)}
+    inputs = {
+        name: Spec(spec.shape[1:], spec.dtype) if name in batched else spec for name, spec in function.inputs.items()
+    }
+    arguments = dataclasses.replace(function, inputs=inputs).arguments()
     closed = jax.make_jaxpr(lambda *inputs: function.call(function.params, *inputs))(*arguments)
     # Traced before jax2onnx traces it, which replaces functions of JAX meanwhile.
     plain = jax.make_jaxpr(lambda *inputs: plain_jaxpr.evaluate(closed, inputs))(*arguments)
-    run = core.jaxpr_as_fun(plain)
+    # Without what only gradients read: a loop would store it for every step.
+    used, _ = partial_eval.dce_jaxpr(plain.jaxpr, [True] * len(function.outputs), instantiate=True)
+    run = core.jaxpr_as_fun(core.ClosedJaxpr(used, plain.consts))
     with _quiet():
-        _register_operators()
+        onnx_forms.register()
         model = importlib.import_module("jax2onnx").to_onnx(
             lambda *inputs: tuple(run(*inputs)),
             arguments,
             model_name=function.name,
             opset=opset,
-            input_names=list(function.inputs),
-            output_names=list(function.outputs),
+            input_names=[f"{name}{_SAMPLE}" if name in batched else name for name in function.inputs],
+            output_names=[f"{name}{_SAMPLE}" if batched else name for name in function.outputs],
         )
     onnx_graph.hoist_constants(model.graph)
     onnx_graph.remove_unused(model.graph)
+    if batched:
+        names = [*batched, *function.outputs]
+        onnx_graph.map_leading(model.graph, {f"{name}{_SAMPLE}": name for name in names}, BATCH.symbol)
     return model
 
 
@@ -160,48 +188,37 @@ def require_packages() -> None:
         )
 
 
-def _without_batch(function: Function) -> Function:
-    """Return a function of one sample, and of the decoders one that maps it over the batch.
+def _by_sample(decoder: Function) -> Function:
+    """Return a decoder that maps the function of one sample over the leading axes of the landmarks.
 
     Whole batches are decoded piece by piece, in numbers that are known when a function is traced.
     """
-    specs = function.inputs.values()
-    batched = [bool(spec.shape) and spec.shape[0] == BATCH for spec in specs]
-    alone = [Spec(spec.shape[1:], spec.dtype) if lead else spec for spec, lead in zip(specs, batched, strict=True)]
-    single = dataclasses.replace(function, inputs=dict(zip(function.inputs, alone, strict=True)))
-    if not function.name.startswith("decoder"):
-        return single
-    shapes = single.arguments({})
+    shapes = [spec.shape[1:] if name == "landmarks" else spec.shape for name, spec in decoder.inputs.items()]
+    samples = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
 
     def call(params: Arrays, *inputs: Any) -> tuple[jax.Array, ...]:
-        one = jax.make_jaxpr(lambda *sample: function.call(params, *sample))(*shapes)
-        axes = [0 if lead else None for lead in batched]
-        return tuple(jax.vmap(lambda *sample: plain_jaxpr.evaluate(one, sample), axes)(*inputs))
+        *face, landmarks = inputs
+        one = jax.make_jaxpr(lambda *sample: decoder.call(params, *sample))(*samples)
 
-    return dataclasses.replace(function, call=call)
+        def decode(landmarks: Any) -> list[Any]:
+            return plain_jaxpr.evaluate(one, [*face, landmarks])
+
+        for _ in landmarks.shape[:-2]:
+            decode = jax.vmap(decode)
+        return tuple(decode(landmarks))
+
+    return dataclasses.replace(decoder, call=call)
 
 
-def _register_operators() -> None:
-    """Tell jax2onnx the operators of the primitives of `facejax.export.onnx_forms`."""
-    system = importlib.import_module("jax2onnx.plugins.plugin_system")
-    for primitive, operator in _OPERATORS.items():
-        if primitive in system.PLUGIN_REGISTRY:
-            continue
+def _in_sequence(chain: Function, motion: Function, decoder: Function) -> Function:
+    """Return the chain as a call of the motion and one of the decoder, by the names of their inputs."""
 
-        class Plugin(system.PrimitiveLeafPlugin):
-            _operator = operator
+    def call(params: Arrays, *inputs: Any) -> tuple[jax.Array, ...]:
+        arrays = dict(zip(chain.inputs, inputs, strict=True))
+        (arrays["landmarks"],) = motion.call(params, *(arrays[name] for name in motion.inputs))
+        return decoder.call(params, *(arrays[name] for name in decoder.inputs))
 
-            def lower(self, ctx: Any, eqn: Any) -> None:
-                inputs = [ctx.get_value_for_var(v, name_hint=ctx.fresh_name("input")) for v in eqn.invars]
-                like = ctx.get_value_for_var(eqn.outvars[0], name_hint=ctx.fresh_name("output"))
-                made = getattr(ctx.builder, self._operator)(*inputs, _outputs=[like.name], **eqn.params)
-                made.type, made.shape = like.type, like.shape
-                ctx.bind_value_for_var(eqn.outvars[0], made)
-
-        system.register_primitive(
-            jaxpr_primitive=primitive, jax_doc="", onnx=[], since="", context="primitives.facejax", component=primitive,
-            testcases=[],
-        )(Plugin)  # fmt: skip
+    return dataclasses.replace(chain, call=call)
 
 
 @contextlib.contextmanager

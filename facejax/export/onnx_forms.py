@@ -9,6 +9,7 @@ vertices, F triangles.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ from facejax.mesh.stencils import Stencil
 from facejax.mesh.strain import VertexTriangles
 
 TAKE, ELU = "facejax_take", "facejax_elu"  # names of primitives
+_OPERATORS = {TAKE: "Gather", ELU: "Elu"}
 
 
 def take(x: Any, index: np.ndarray, *, axis: int) -> jax.Array:
@@ -75,6 +77,29 @@ def strain(
     # The normals do not depend on the displacements. Added to zeros that do, they get the batch axis under `vmap` by an
     # addition: jax2onnx takes a wrong size for an axis that is broadcast otherwise.
     return mean.T[:, None], upward + 0 * displacements
+
+
+def register() -> None:
+    """Tell jax2onnx the operators of the primitives."""
+    system = importlib.import_module("jax2onnx.plugins.plugin_system")
+    for primitive, operator in _OPERATORS.items():
+        if primitive in system.PLUGIN_REGISTRY:
+            continue
+
+        class Plugin(system.PrimitiveLeafPlugin):
+            _operator = operator
+
+            def lower(self, ctx: Any, eqn: Any) -> None:
+                inputs = [ctx.get_value_for_var(v, name_hint=ctx.fresh_name("input")) for v in eqn.invars]
+                like = ctx.get_value_for_var(eqn.outvars[0], name_hint=ctx.fresh_name("output"))
+                made = getattr(ctx.builder, self._operator)(*inputs, _outputs=[like.name], **eqn.params)
+                made.type, made.shape = like.type, like.shape
+                ctx.bind_value_for_var(eqn.outvars[0], made)
+
+        system.register_primitive(
+            jaxpr_primitive=primitive, jax_doc="", onnx=[], since="", context="primitives.facejax", component=primitive,
+            testcases=[],
+        )(Plugin)  # fmt: skip
 
 
 def _about(values: Array, about: np.ndarray) -> Array:

@@ -1,7 +1,8 @@
-"""Make ONNX graphs smaller: constants of a loop are read from outside of it, and constant operations are computed."""
+"""Change ONNX graphs: loops read constants from outside, and the graph of one sample becomes that of a batch."""
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 
@@ -41,6 +42,33 @@ def remove_unused(graph: Any) -> None:
         for attribute in node.attribute:
             if attribute.HasField("g"):
                 remove_unused(attribute.g)
+
+
+def map_leading(graph: Any, names: dict[str, str], symbol: str) -> None:
+    """Map a graph over a new leading axis of some of its inputs and of all outputs, in place, by one Scan.
+
+    Constants and the other inputs are read from outside of it.
+
+    Args:
+      graph: an `onnx.GraphProto`.
+      names: new names of the inputs and outputs that get the axis.
+      symbol: the name of its size.
+    """
+    helper = importlib.import_module("onnx").helper
+
+    def mapped(one: Any) -> Any:
+        if one.name not in names:
+            return one
+        dims = one.type.tensor_type.shape.dim
+        shape = [dim.dim_value if dim.HasField("dim_value") else dim.dim_param or None for dim in dims]
+        return helper.make_tensor_value_info(names[one.name], one.type.tensor_type.elem_type, [symbol, *shape])
+
+    samples = [one for one in graph.input if one.name in names]
+    inputs, outputs = [mapped(one) for one in graph.input], [mapped(one) for one in graph.output]
+    body = helper.make_graph(graph.node, "sample", samples, graph.output, value_info=graph.value_info)
+    read, made = [names[one.name] for one in samples], [one.name for one in outputs]
+    scan = helper.make_node("Scan", read, made, body=body, num_scan_inputs=len(samples))
+    graph.CopyFrom(helper.make_graph([scan], graph.name, inputs, outputs, graph.initializer))
 
 
 def _read(graph: Any) -> list[str]:

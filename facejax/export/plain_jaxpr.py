@@ -72,6 +72,8 @@ def _equation(equation: Any, inputs: list[Any]) -> Sequence[Any]:
         return _inline(params["branches"][int(inputs[0])], inputs[1:])
     if name == "scan":
         return _scan(params, inputs)
+    if name == "gather" and (window := _window(params, inputs)) is not None:
+        return [window]
     return _bind(equation, inputs)
 
 
@@ -100,6 +102,18 @@ def _scan(params: dict[str, Any], inputs: list[Any]) -> Sequence[Any]:
     # The length is that of the rows; `scan` takes no symbolic one.
     carry, made = jax.lax.scan(advance, start, rows, length=None if rows else int(length), reverse=params["reverse"])
     return [*carry, *made]
+
+
+def _window(params: dict[str, Any], inputs: list[Any]) -> Any | None:
+    """Return a gather of one window at constant indices as a slice, whose sizes may be symbolic; None: of others."""
+    (x, indices), axes = inputs, params["dimension_numbers"]
+    if isinstance(indices, Tracer) or np.ndim(indices) != 1 or axes.operand_batching_dims:
+        return None
+    start = [0] * x.ndim
+    for axis, index in zip(axes.start_index_map, np.asarray(indices), strict=True):
+        start[axis] = int(index)
+    stop = [first + size for first, size in zip(start, params["slice_sizes"], strict=True)]
+    return jnp.squeeze(jax.lax.slice(x, start, stop), axes.collapsed_slice_dims)
 
 
 def _is_constant(equation: Any, inputs: Sequence[Any]) -> bool:

@@ -137,7 +137,7 @@ def predict_scheduled(
     """
     _check(params, steps, "steps")
     x, base = _encode(params, steps, neutral)
-    given = jnp.broadcast_to(jnp.asarray(given).at[..., 0].set(True), x.shape[:-1])
+    given = jnp.broadcast_to(given | (jnp.arange(x.shape[-2]) == 0), x.shape[:-1])
     carry = jax.lax.stop_gradient(params.scale.carry)
 
     def inside(x: Array, base: Array, given: Array) -> Array:
@@ -184,11 +184,11 @@ def continue_curve(
     known: int | Int[Array | np.ndarray, ""],
     neutral: Float[Array | np.ndarray, "... L 3"] | None = None,
     *,
-    stop: float | Real[Array, ""] = 0.0,
+    stop: float | Real[Array, ""] | None = None,
 ) -> Float[Array, "... T L 3"]:
     """Continue the first `known` frames (1 or more) of a curve to its length; its other frames are not read.
 
-    `generate` for arrays: neither the length nor `known` is static. `neutral` and `stop` as there.
+    `generate` for arrays: neither the length nor `known` is static. `neutral` and `stop` as there; None is 0.
 
     Raises:
       ValueError: wrong shapes.
@@ -202,6 +202,8 @@ def continue_curve(
     made = predict_scheduled(params, steps, jnp.arange(frames - 1) < known, neutral)
     made = jnp.where(time < known - 1, given, made)
     curve = jnp.cumsum(jnp.concatenate([jnp.zeros_like(jnp.asarray(curve)[..., :1, :, :]), made], axis=-3), axis=-3)
+    if stop is None:
+        return curve
     last = jnp.where(stop > 0, expression_length(curve, fraction=stop), frames) - 1
     place = jnp.minimum(jnp.arange(frames), last[..., None])
     return jnp.take_along_axis(curve, place[..., None, None], axis=-3)
@@ -240,8 +242,9 @@ def _encode(
     base = scale.carry * x
     if neutral is not None:
         _check(params, neutral[..., None, :, :], "neutral")
-        first = ((neutral - scale.neutral_mean) / scale.neutral_std).reshape(*neutral.shape[:-2], -1)
-        x, base = x.at[..., 0, :].set(first), base.at[..., 0, :].set(0)
+        first = ((neutral - scale.neutral_mean) / scale.neutral_std).reshape(*neutral.shape[:-2], 1, -1)
+        begins = jnp.arange(x.shape[-2])[:, None] == 0
+        x, base = jnp.where(begins, first, x), jnp.where(begins, 0, base)
     return x, base
 
 

@@ -58,11 +58,11 @@ def test_the_lstm_gives_what_the_expression_networks_give(start):
     expected = np.broadcast_to(expected, (3, 12, 4, 3))
     arrays = {"label": np.int32(1), "known": np.int32(1), "neutral": neutral}
     curve = np.full((3, 12, 4, 3), 7, np.float32)  # frames that are not known are not read
-    np.testing.assert_allclose(call(function, arrays | {"curve": curve})["curve"], expected, atol=1e-6)
+    np.testing.assert_allclose(call(function, arrays | {"curve": curve})["continued"], expected, atol=1e-6)
     prefix = expected[:, :5] + np.linspace(0, 0.1, 5, dtype=np.float32)[:, None, None]
     continued = expressions.displacements(networks, "anger", neutral, frames=12, prefix=prefix, stop=0)
     arrays |= {"known": np.int32(5), "curve": np.concatenate([prefix, curve[:, 5:]], axis=1)}
-    np.testing.assert_allclose(call(function, arrays)["curve"], continued, atol=1e-6)
+    np.testing.assert_allclose(call(function, arrays)["continued"], continued, atol=1e-6)
 
 
 def test_arguments_have_symbolic_or_given_sizes():

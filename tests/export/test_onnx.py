@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from facejax.export import functions, onnx, onnx_forms, onnx_graph
-from facejax.inference import composition, pipeline
+from facejax.inference import pipeline
 from facejax.mesh import spiral_conv, strain
 from tests import tiny_models
+from tests.export import exports
 
 TOLERANCE_MM = 1e-4
 NEEDED = pytest.mark.skipif(
@@ -20,9 +21,12 @@ NEEDED = pytest.mark.skipif(
 )
 
 
+models_of = functools.cache(tiny_models.make)
+
+
 @functools.cache
 def converted(name, **options):
-    function = onnx.catalogue(tiny_models.make(**options), [name])[name]
+    function = onnx.catalogue(models_of(**options), [name])[name]
     return function, onnx.convert(function)
 
 
@@ -35,33 +39,45 @@ def run(proto, inputs):
     return session.run(None, {name: np.asarray(value) for name, value in inputs.items()})
 
 
-def motion_inputs(models, labels, frames, *, intensity):
-    """Noise of a key, and the rest of the inputs of "motion"."""
-    noise = pipeline.sample_noise(models, jax.random.key(3), np.asarray(labels))
-    face = pipeline.prepare(models, models.face.vertices)
-    return noise, face, {
-        "choice": noise.choice, "blur": noise.blur, "noise": noise.transitions, "labels": np.array(labels, np.int32),
-        "timeline": composition.timeline(frames, drawn=len(models.motion.chart.p) + 1),
-        "rest": face.landmarks, "size": face.size, "intensity": np.float32(intensity),
-    }  # fmt: skip
+@NEEDED
+@pytest.mark.parametrize("generator", ["flow", "gan"])
+def test_one_file_makes_batches_of_motions_of_any_number_of_transitions_and_frames(generator):
+    models = models_of(generator=generator)
+    function, proto = converted("motion", generator=generator)
+    for batch, frames in ((1, [7]), (3, [4, 9])):
+        arrays, _, expected = exports.inputs(models, batch=batch, frames=frames)
+        (found,) = run(proto, {name: arrays[name] for name in function.inputs})
+        np.testing.assert_allclose(found, expected, atol=TOLERANCE_MM)
 
 
 @NEEDED
-@pytest.mark.parametrize("generator", ["flow", "gan"])
-def test_one_file_makes_motions_of_any_number_of_transitions_and_frames(generator):
-    models = tiny_models.make(generator=generator)
-    _, proto = converted("motion", generator=generator)
-    for labels, frames in (([0, 1], [7]), ([2, 0, 1, 2], [4, 9, 2])):
-        noise, face, inputs = motion_inputs(models, labels, frames, intensity=1.3)
+def test_the_chain_makes_batches_of_vertices():
+    models = models_of()
+    function, proto = converted("chain")
+    arrays, face, motion = exports.inputs(models, batch=3, frames=[4, 9])  # as for the motion: compiled already
+    (found,) = run(proto, {name: arrays[name] for name in function.inputs})
+    np.testing.assert_allclose(found, pipeline.vertices(models, face, motion), atol=TOLERANCE_MM)
+
+
+@NEEDED
+def test_one_file_continues_curves_of_any_number_of_frames():
+    networks = exports.networks(start="neutral")  # has all operations of "zero", and reads the face
+    function = onnx.catalogue(models_of(), ["lstm"], networks=networks)["lstm"]
+    proto, rng = onnx.convert(function), np.random.default_rng(0)
+    for batch, frames, known, label in ((1, 2, 1, 0), (3, 9, 4, 1), (2, 5, 5, 0)):
+        inputs = {
+            "label": np.int32(label), "known": np.int32(known),
+            "curve": 0.1 * rng.normal(size=(batch, frames, 4, 3)), "neutral": rng.normal(size=(batch, 4, 3)),
+        }  # fmt: skip
+        inputs = {name: np.asarray(inputs[name], spec.dtype) for name, spec in function.inputs.items()}
         (found,) = run(proto, inputs)
-        expected = pipeline.motion_from_noise(models, noise, np.array(labels), face, frames=frames, intensity=1.3)
-        np.testing.assert_allclose(found, expected, atol=TOLERANCE_MM)
+        np.testing.assert_allclose(found, function.call(function.params, *inputs.values())[0], atol=1e-5)
 
 
 @NEEDED
 @pytest.mark.parametrize("decoder", ["gpmm", "s2d"])
 def test_one_file_decodes_any_number_of_frames_of_any_face(decoder):
-    models = tiny_models.make(decoder=decoder)
+    models = models_of(decoder=decoder)
     names = ["decoder", "decoder_linear"] if decoder == "gpmm" else ["decoder"]
     for name in names:
         function, proto = converted(name, decoder=decoder)
@@ -77,7 +93,7 @@ def test_one_file_decodes_any_number_of_frames_of_any_face(decoder):
 
 @NEEDED
 def test_a_folder_has_the_files_and_a_manifest_and_is_replaced_whole(tmp_path):
-    models, out = tiny_models.make(), tmp_path / "onnx"
+    models, out = models_of(), tmp_path / "onnx"
     for _ in range(2):
         files = onnx.export(models, out, functions=["decoder_linear"])
     assert files == [out / "manifest.json", out / "decoder_linear.onnx"]
@@ -116,7 +132,7 @@ def test_loops_pass_on_nothing_that_does_not_change():
 
 
 def test_the_forms_for_onnx_are_equal_up_to_rounding():
-    models = tiny_models.make()
+    models = models_of()
     tables, hierarchy = models.decoder.tables, models.hierarchy
     rng = np.random.default_rng(0)
     for stencil in (*hierarchy.climbs, hierarchy.surface):

@@ -113,7 +113,7 @@ def test_loaded_functions_take_named_arrays_of_any_batch_and_time(folder):
     for frames in (2, 11):
         expected = expressions.displacements(exports.networks(), "joy", neutral, frames=frames, stop=0)
         curve = np.zeros((2, frames, 4, 3))
-        found = loaded["lstm"](label=0, curve=curve, known=1, neutral=neutral)["curve"]
+        found = loaded["lstm"](label=0, curve=curve, known=1, neutral=neutral)["continued"]
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 

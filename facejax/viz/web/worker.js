@@ -53,15 +53,16 @@ async function generate(id, job) {
   const matrix = timeline(lengths, model.drawn), frames = matrix.length / (transitions * model.drawn);
   const float = (values, shape) => new ort.Tensor("float32", Float32Array.from(values), shape);
   const begin = performance.now();
+  // A batch of one motion.
   const {landmarks} = await sessions.motion.run({
-    choice: float([noise.choice], []),
-    blur: float(noise.blur, [model.noise.blur]),
-    noise: float(noise.transitions, [transitions, model.noise.noise]),
-    labels: new ort.Tensor("int32", Int32Array.from(job.labels), [transitions + 1]),
+    choice: float([noise.choice], [1]),
+    blur: float(noise.blur, [1, model.noise.blur]),
+    noise: float(noise.transitions, [1, transitions, model.noise.noise]),
+    labels: new ort.Tensor("int32", Int32Array.from(job.labels), [1, transitions + 1]),
     timeline: float(matrix, [frames, transitions * model.drawn]),
     rest: face.tensors.rest,
     size: face.tensors.size,
-    intensity: float([job.intensity], []),
+    intensity: float([job.intensity], [1]),
   });
   const motion = performance.now() - begin, points = landmarks.data, width = points.length / frames;
   const known = {...face.tensors};
@@ -72,7 +73,7 @@ async function generate(id, job) {
     await new Promise(resolve => setTimeout(resolve));
     if (newest !== id) return;
     const count = Math.min(CHUNK, frames - first), start = performance.now();
-    const part = new ort.Tensor("float32", points.slice(first * width, (first + count) * width), [count, ...landmarks.dims.slice(1)]);
+    const part = new ort.Tensor("float32", points.slice(first * width, (first + count) * width), [count, ...landmarks.dims.slice(2)]);
     const {vertices} = await sessions.decoder.run({...known, landmarks: part});
     decoding += performance.now() - start;
     const data = Float32Array.from(vertices.data);
