@@ -76,7 +76,7 @@ def model(own, tmp_path_factory):
     examples = transitions.encode_examples(chart, known)
     motion = fit_motion.fit_flow(examples, chart, path.with_suffix(""), plan=fit_motion.FlowPlan(steps=2, batch=8))
     starts = transitions.fit_start_poses(chart, motions.halves(data, "train"))
-    pipeline.save(path, pipeline.load()._replace(labels=LABELS, motion=motion, starts=starts))
+    pipeline.save(path, pipeline.load().replace(labels=pipeline.Labels(LABELS), motion=motion, starts=starts))
     return path
 
 
