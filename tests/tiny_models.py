@@ -16,6 +16,7 @@ from tests.models.motion.test_flow_matching import CONFIG as FLOW
 from tests.models.motion.test_motion3dgan import CONFIG, fitted, plain_weights, toy
 
 LABELS = bundle.Labels(("neutral", "smile", "frown"))
+CHANNELS = (8, 4, 4)  # of two levels: tests compile many functions
 
 
 @functools.cache
@@ -32,20 +33,20 @@ def make(*, generator: str = "flow", decoder: str = "gpmm", subdivisions: int = 
             motion = motion3dgan.generator.init(jax.random.key(0), chart, config=CONFIG)
         else:
             motion = flow_matching.init(jax.random.key(0), chart, config=FLOW)
-    hierarchy = jax.device_put(mesh_hierarchy.build(rest, faces, factors=(2, 2, 2, 2), lengths=3))
+    hierarchy = jax.device_put(mesh_hierarchy.build(rest, faces, factors=(3, 3), lengths=3))
     if decoder == "gpmm":
         moved = np.einsum("tk,knx->tnx", rng.normal(size=(30, 5)), modes)
         person = gpmm_fit.Person(rest, moved[:, marks], moved)
         base = gpmm_fit.fit([person], faces, marks, prior=gpmm.Prior(True, 0.1, 1e-3), components=5)
         ones = jnp.ones(())
         scale = residual.Scale(jnp.asarray(rest, jnp.float32), jnp.zeros((4, 3)), ones, 0.1 * ones)
-        network = residual.init(jax.random.key(1), hierarchy, scale)
+        network = residual.init(jax.random.key(1), hierarchy, scale, channels=CHANNELS, width=4)
         shared = 0.1 * jax.random.normal(jax.random.key(2), network.weights["shared"].shape)
         network = network._replace(weights=network.weights | {"shared": shared})
         tables = jax.device_put(strain.vertex_triangles(faces, len(rest)))
         decoded = gpmm_residual.GPMMResidual(in_float32(base), network, hierarchy, tables)
     else:
-        decoded = s2d_dec.init(jax.random.key(1), hierarchy, landmarks=4)
+        decoded = s2d_dec.init(jax.random.key(1), hierarchy, landmarks=4, channels=CHANNELS)
     return bundle.Models(
         labels=LABELS,
         face=bundle.Face(rest.astype(np.float32), faces, marks, np.zeros(0, np.int32), np.ones(len(rest), bool)),

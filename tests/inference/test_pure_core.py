@@ -21,7 +21,14 @@ KEY = jax.random.key(7)
 
 @pytest.fixture(scope="module", params=["gpmm", "s2d"])
 def models(request):
-    return tiny_models.make(decoder=request.param)
+    """Each decoder with one of the generators; the flow takes longer to compile."""
+    return tiny_models.make(decoder=request.param, generator={"gpmm": "gan", "s2d": "flow"}[request.param])
+
+
+@pytest.fixture(scope="module")
+def gpmm_models():
+    """For what does not depend on the decoder."""
+    return tiny_models.make(generator="gan")
 
 
 @pytest.fixture(scope="module")
@@ -67,16 +74,16 @@ def test_vmap_over_keys_labels_and_faces_at_once(models, neutrals):
         )
 
 
-def test_leading_axes_of_labels_are_one_motion_each(models, neutrals):
-    face = pipeline.prepare(models, neutrals[0])
+def test_leading_axes_of_labels_are_one_motion_each(gpmm_models, neutrals):
+    face = pipeline.prepare(gpmm_models, neutrals[0])
     labels = np.array([[[0, 1], [0, 2]], [[1, 0], [2, 0]]], np.int32)
-    found = pipeline.motion(models, KEY, labels, face, frames=FRAMES)
+    found = pipeline.motion(gpmm_models, KEY, labels, face, frames=FRAMES)
     keys = jax.random.split(KEY, (2, 2))
     assert found.shape == (2, 2, FRAMES, 4, 3)
     for i in np.ndindex(2, 2):
-        one = pipeline.motion(models, keys[i], labels[i], face, frames=FRAMES)
+        one = pipeline.motion(gpmm_models, keys[i], labels[i], face, frames=FRAMES)
         np.testing.assert_allclose(found[i], one, atol=1e-5)
-    np.testing.assert_array_equal(pipeline.motion(models, keys, labels, face, frames=FRAMES), found)
+    np.testing.assert_array_equal(pipeline.motion(gpmm_models, keys, labels, face, frames=FRAMES), found)
 
 
 @pytest.mark.parametrize("what", ["neutral", "intensity", "landmarks", "noise"])
@@ -112,17 +119,17 @@ def test_float32_models_stay_float32_where_float64_is_enabled(neutrals, generato
         np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_inside_scan(models, neutrals):
-    face = pipeline.prepare(models, neutrals[0])
+def test_inside_scan(gpmm_models, neutrals):
+    face = pipeline.prepare(gpmm_models, neutrals[0])
     keys = jax.random.split(KEY, 3)
 
     def advance(total, key):
-        moved = pipeline.motion(models, key, LABELS, face, frames=FRAMES)
-        return total + pipeline.vertices(models, face, moved[-1]), None
+        moved = pipeline.motion(gpmm_models, key, LABELS, face, frames=FRAMES)
+        return total + pipeline.vertices(gpmm_models, face, moved[-1]), None
 
     found, _ = jax.lax.scan(advance, jnp.zeros_like(face.neutral), keys)
-    each = [pipeline.motion(models, key, LABELS, face, frames=FRAMES)[-1] for key in keys]
-    np.testing.assert_allclose(found, sum(pipeline.vertices(models, face, one) for one in each), atol=2e-4)
+    each = [pipeline.motion(gpmm_models, key, LABELS, face, frames=FRAMES)[-1] for key in keys]
+    np.testing.assert_allclose(found, sum(pipeline.vertices(gpmm_models, face, one) for one in each), atol=2e-4)
 
 
 def sharded(models, neutral):
@@ -146,7 +153,7 @@ def test_under_shard_map_on_four_devices():
         "import jax; jax.config.update('jax_num_cpu_devices', 4)\n"
         "from tests import tiny_models\n"
         "from tests.inference import test_pure_core\n"
-        "models = tiny_models.make()\n"
+        "models = tiny_models.make(generator='gan')\n"
         "print(test_pure_core.sharded(models, models.face.vertices), 'devices')"
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
@@ -154,13 +161,13 @@ def test_under_shard_map_on_four_devices():
     assert done.stdout.split() == ["4", "devices"]
 
 
-def test_eight_threads_get_the_same(models, neutrals):
+def test_eight_threads_get_the_same(gpmm_models, neutrals):
     keys = jax.random.split(KEY, 8)
-    expected = [np.asarray(whole(models, key, LABELS, neutrals[i % 3])) for i, key in enumerate(keys)]
+    expected = [np.asarray(whole(gpmm_models, key, LABELS, neutrals[i % 3])) for i, key in enumerate(keys)]
     found = [None] * 8
 
     def work(i):
-        found[i] = np.asarray(whole(models, keys[i], LABELS, neutrals[i % 3]))
+        found[i] = np.asarray(whole(gpmm_models, keys[i], LABELS, neutrals[i % 3]))
 
     threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
     for thread in threads:
@@ -172,9 +179,9 @@ def test_eight_threads_get_the_same(models, neutrals):
 
 
 def test_one_compilation_per_shape_and_models_of_other_sizes(neutrals):
-    small = tiny_models.make()
+    small = tiny_models.make(generator="gan")
     other = small.replace(about=small.about | {"seed": 1}, starts=jax.tree.map(lambda x: x * 0.5, small.starts))
-    large = tiny_models.make(subdivisions=3)
+    large = tiny_models.make(generator="gan", subdivisions=3)
     traced = []
 
     @jax.jit
@@ -191,7 +198,7 @@ def test_one_compilation_per_shape_and_models_of_other_sizes(neutrals):
 
 
 def test_without_a_share_of_the_network_the_answer_is_the_linear_one(neutrals):
-    models = tiny_models.make()
+    models = tiny_models.make(generator="gan")
     network = models.decoder.network._replace(gate=jnp.zeros(()))
     closed = models.replace(decoder=models.decoder.replace(network=network))
     face = pipeline.prepare(closed, neutrals[0])
@@ -220,17 +227,19 @@ def test_wrong_arguments_are_named(models, neutrals):
         pipeline.prepare(models, neutrals[0][1:])
 
 
-def test_motion_is_a_function_of_its_noise(models, neutrals):
-    face = pipeline.prepare(models, neutrals[0])
+def test_motion_is_a_function_of_its_noise(gpmm_models, neutrals):
+    face = pipeline.prepare(gpmm_models, neutrals[0])
     labels = np.array([[1, 0, 2], [0, 1, 0]])
-    noise = pipeline.sample_noise(models, KEY, labels)
-    found = pipeline.motion_from_noise(models, noise, labels, face, frames=FRAMES, intensity=0.5)
-    expected = pipeline.motion(models, KEY, labels, face, frames=FRAMES, intensity=0.5)
+    noise = pipeline.sample_noise(gpmm_models, KEY, labels)
+    found = pipeline.motion_from_noise(gpmm_models, noise, labels, face, frames=FRAMES, intensity=0.5)
+    expected = pipeline.motion(gpmm_models, KEY, labels, face, frames=FRAMES, intensity=0.5)
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    slope = jax.grad(lambda x: jnp.sum(pipeline.motion_from_noise(models, x, labels, face, frames=FRAMES) ** 2))(noise)
+    slope = jax.grad(lambda x: jnp.sum(pipeline.motion_from_noise(gpmm_models, x, labels, face, frames=FRAMES) ** 2))(
+        noise
+    )
     assert np.abs(slope.transitions).max() > 0 and np.isfinite(slope.transitions).all()
     with pytest.raises(ValueError, match="noise: expected arrays of shapes"):
-        pipeline.motion_from_noise(models, noise, labels[0], face)
+        pipeline.motion_from_noise(gpmm_models, noise, labels[0], face)
 
 
 def products(jaxpr):
@@ -245,7 +254,7 @@ def products(jaxpr):
 
 def test_products_of_positions_ask_for_all_bits():
     """A GPU's default would round them; a CPU's does not, so that only the program can tell."""
-    models = tiny_models.make()
+    models = tiny_models.make(generator="gan")
     neutral, marks = models.face.vertices, jnp.zeros((3, 4, 3))
 
     def linear(models, neutral, noise):
